@@ -17,7 +17,7 @@ from gsx.core.data.scene import View
 from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.regenerator import Regenerator, RegeneratorContext, Request
 from gsx.core.training.run import Run
-from gsx.experiments.runs.settings import typed
+from gsx.experiments.runs.typed import typed
 
 EDGE = 48
 

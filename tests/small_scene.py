@@ -15,7 +15,7 @@ from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import BackboneContext
 from gsx.core.training.training_views import TrainingViews
-from gsx.experiments.runs.settings import typed
+from gsx.experiments.runs.typed import typed
 
 
 class Grey:

@@ -11,7 +11,7 @@ import torch
 from gsx.core.data.images import write_image
 from gsx.core.plugins import load_plugins
 from gsx.experiments.runs.compose import compose_raw, hydra_session
-from gsx.experiments.runs.settings import typed
+from gsx.experiments.runs.typed import typed
 from gsx.scenes.colmap import ColmapOptions
 
 WIDTH, HEIGHT = 64, 48

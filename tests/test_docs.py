@@ -62,13 +62,13 @@ def test_the_commands_of_the_readme_are_found() -> None:
 def test_keys_named_for_those_who_come_from_elsewhere_exist() -> None:
     """In docs/coming-from.md: `a.b.c` is a key of some composition, words after it are its neighbours."""
     from gsx.builtin import plugins
-    from gsx.experiments.runs.compose import Compositions
+    from gsx.experiments.runs.compose import Compositions, listed
 
     text = (ROOT / "docs" / "coming-from.md").read_text()
     with Compositions(plugins()) as compositions:
         words = [
             ["scene=blender"],
-            *([f"backbone={name}", "scene=colmap"] for name in compositions.choices("backbone")),
+            *([f"backbone={name}", "scene=colmap"] for name in listed("backbone")),
         ]
         known = {key for one in words for key in compositions.keys(one)}
     rows = [row.split("|")[-2] for row in text.splitlines() if row.startswith(("| `", "| -"))]

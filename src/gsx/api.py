@@ -6,7 +6,7 @@
     picture = run.render(run.scene.test[0], zoom=4)
     print(run.evaluate(zoom=[1, 2, 4])["psnr"])
 
-What the command line tells while it works goes to the logger `gsx`; `gsx.show_messages()` shows it.
+Messages go to the logger `gsx`; `gsx.show_messages()` shows them.
 """
 
 import json
@@ -19,14 +19,13 @@ import torch
 from torch import Tensor
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import ZOOMS, is_override, refuse_beyond
-from gsx.cli.messages import set_up_logging as show_messages
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError, command
 from gsx.core.files import at_home
 from gsx.core.gaussians.splats import Gaussians
+from gsx.core.ranges import ZOOMS
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Float
 from gsx.core.training.render import render, render_gaussians
@@ -34,10 +33,12 @@ from gsx.core.training.run import Run
 from gsx.engine.processes import processes
 from gsx.engine.threads import relieve_oversubscription
 from gsx.experiments.runs.again import evaluate_again
-from gsx.experiments.runs.compose import compose, quoted
+from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.export import export, refuse_export
 from gsx.experiments.runs.job import train as train_job
+from gsx.experiments.runs.messages import set_up_logging as show_messages
 from gsx.experiments.runs.open import open_run
+from gsx.experiments.runs.overrides import is_override, quoted
 from gsx.experiments.runs.render import view_named
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import rules_of
@@ -84,20 +85,19 @@ class TrainedRun:
 
     @relieve_oversubscription()
     def render(self, seen: Camera | View | str, zoom: float = 1) -> Float[Tensor, "3 H W"]:
-        """The model seen by a camera, or by a view or the camera of the view of that name; colours in [0, 1].
+        """Returns the model as a camera, a view, or the view of that name sees it; colours in [0, 1].
 
         zoom: times the raster and the focal length.
 
         Raises:
             InputError: there is no view of that name, the nearest is told; or zoom is none of `ZOOMS`.
         """
-        if isinstance(zoom, str) or zoom is None:
+        if isinstance(zoom, str) or zoom is None or float(zoom) not in ZOOMS:
             raise InputError(f"zoom is {zoom!r}: give a number {ZOOMS}")
-        refuse_beyond("zoom", zoom := float(zoom), ZOOMS)
-        return render(self.run, camera_in(self.run, seen).zoom(zoom), self.settings.evaluation.tile_pixels).image
+        return render(self.run, camera_in(self.run, seen).zoom(float(zoom)), self.settings.evaluation.tile_pixels).image
 
     def evaluate(self, **options: Any) -> dict[str, Any]:
-        """Judge the run on its test views, as `gsx eval` does: evaluation.json, pictures and report are written anew.
+        """Evaluates the run on its test views, as `gsx eval` does: writes evaluation.json, pictures and report anew.
 
         Options are those of the group eval, for example zoom=[1, 2, 4].
 
@@ -116,9 +116,10 @@ class TrainedRun:
         axes: str = SPECIFIED,
         spz_version: int = SPZ_VERSIONS[0],
     ) -> Path:
-        """Write the model as a splat file or a page (.html), by suffix; `seen`: only what is drawn for that view, or by
-        that camera; `local`: relative to `scene.origin`, which the file states where it can; axes (rub, rdf) and
-        spz_version (3, 4): of .spz.
+        """Writes the model as a splat file or a page (.html), by suffix.
+
+        seen: only what is drawn for that view or camera. local: relative to `scene.origin`, which the file states where
+        it can. axes (rub, rdf) and spz_version (3, 4): of .spz.
 
         Raises:
             InputError: the suffix is that of no format that is written, there is no such view, or no such form of .spz;
@@ -150,7 +151,7 @@ class SplatFile:
     def render(
         self, seen: Camera | View, background: Sequence[float] | Float[Tensor, "3"] = (0, 0, 0)
     ) -> Float[Tensor, "3 H W"]:
-        """The splats seen by a camera, or by that of a view, over a colour; colours in [0, 1].
+        """Returns the splats as a camera or a view sees them over a colour; colours in [0, 1].
 
         Raises:
             InputError: the background is no colour.
@@ -168,12 +169,12 @@ class SplatFile:
 
 
 def camera_in(run: Run, seen: Camera | View | str) -> Camera:
-    """A camera, that of a view, or that of a run's view of that name; errors as `camera_of` and `view_named`."""
+    """Returns a camera, that of a view, or that of a run's view of that name; see `camera_of` and `view_named`."""
     return camera_of(view_named(run, seen) if isinstance(seen, str) else seen)
 
 
 def camera_of(seen: Camera | View) -> Camera:
-    """A camera, or that of a view.
+    """Returns a camera, or that of a view.
 
     Raises:
         InputError: it is neither.
@@ -184,10 +185,10 @@ def camera_of(seen: Camera | View) -> Camera:
     return camera
 
 
-def train(*given: str, **values: Any) -> TrainedRun:
-    """Train, evaluate and report: `gsx GIVEN... KEY=VALUE...`.
+def train(*words: str, **values: Any) -> TrainedRun:
+    """Trains, evaluates and reports: `gsx WORDS... KEY=VALUE...`.
 
-    What has dots or a slash in its name is given as on the command line, what has dots also as a dictionary:
+    Keys with dots or a slash are words as on the command line, those with dots also dictionaries:
     `gsx.train("regenerator/upscale=lanczos", "eval.zoom=[1,2]", training={"supersample": 2}, iterations=900)`.
 
     Raises:
@@ -195,13 +196,13 @@ def train(*given: str, **values: Any) -> TrainedRun:
         TrainingError: training went wrong; the run folder holds the last step.
         KeyboardInterrupt: it was stopped; `gsx resume` goes on with the folder.
     """
-    for word in given:
+    for word in words:
         if not (isinstance(word, str) and is_override(word) and not word.startswith("-")):
             raise ConfigError(f"gsx.train was given {word!r}: give settings, as 'scene=colmap' and 'scene.path=FOLDER'")
-    words, folders = [*given, *overrides(values)], list[Path]()
-    if is_table(words) or processes() > 1:
+    overrides, folders = [*words, *words_of(values)], list[Path]()
+    if is_table(overrides) or processes() > 1:
         raise ConfigError("gsx.train trains one run in one process: tables and torchrun are for the command line")
-    if train_job(compose(words, loaded := plugins()), loaded, folders):
+    if train_job(compose(overrides, loaded := plugins()), loaded, folders):
         raise KeyboardInterrupt(f"{command('resume', folders[0])} goes on")
     return load_run(folders[0])
 
@@ -212,10 +213,9 @@ def load(
     origin: tuple[float, float, float] = NO_ORIGIN,
     axes: str = AUTO,
 ) -> TrainedRun | SplatFile:
-    """Open a run folder or a splat file of any kind (`gsx.formats.suffixes.READABLE`).
+    """Opens a run folder or a splat file of any kind (`gsx.formats.suffixes.READABLE`).
 
     raster: the rules by which a splat file is drawn, in place of those that it states.
-
     origin: from where the coordinates of cameras count, `run.scene.origin` for the views of a georeferenced run.
     axes: of the splat file: auto (what it states, else its format's), rub, rdf, or any three letters.
 
@@ -225,44 +225,41 @@ def load(
     """
     path = splat_file_at(at_home(path))
     if path.is_dir():
-        if raster is not None:
-            raise InputError(f"{path} is a run, drawn as it was trained: raster is for splat files")
-        if any(origin):
-            raise InputError(f"{path} is a run, around the origin of its scene: origin is for splat files")
-        if axes != AUTO:
-            raise InputError(f"{path} is a run, in the axes of its scene: axes is for splat files")
+        for name, given in {"raster": raster is not None, "origin": any(origin), "axes": axes != AUTO}.items():
+            if given:
+                raise InputError(f"{path} is a run, drawn as it was trained: {name} is for splat files")
         return load_run(path)
     if not path.exists():
         raise InputError(f"'{path}' does not exist: give a run folder or a splat file")
-    gaussians, own = read_around(path, axes, origin)
-    return SplatFile(path, gaussians, raster or rules_of(path), own)
+    gaussians, subtracted = read_around(path, axes, origin)
+    return SplatFile(path, gaussians, raster or rules_of(path), subtracted)
 
 
 def load_run(folder: Path) -> TrainedRun:
-    """A run folder; errors as `load`."""
+    """Opens a run folder; errors as `load`."""
     return TrainedRun(*open_run(folder.resolve(), plugins()))
 
 
-def overrides(values: Mapping[str, Any], below: str = "") -> list[str]:
-    """Values by name, nested ones too, as words of the command line."""
+def words_of(values: Mapping[str, Any], below: str = "") -> list[str]:
+    """Returns values by name, nested ones too, as words of the command line."""
     words = []
     for name, value in values.items():
         if isinstance(value, Mapping):
-            words += overrides(value, f"{below}{name}.")
+            words += words_of(value, f"{below}{name}.")
         else:
             words.append(f"{below}{name}={text_of(plain(name, value))}")
     return words
 
 
 def text_of(value: Any) -> str:
-    """A plain value as the command line has it."""
+    """Returns a plain value as the command line has it."""
     if isinstance(value, list):
         return f"[{','.join(map(text_of, value))}]"
     return quoted(value) if isinstance(value, str) else json.dumps(value)
 
 
 def plain(name: str, value: Any) -> Any:
-    """A value as JSON has it: numbers of numpy and torch are those of Python, paths texts.
+    """Returns a value as JSON has it: numbers of numpy and torch as those of Python, paths as texts.
 
     Raises:
         ConfigError: it is of no kind that a configuration holds.

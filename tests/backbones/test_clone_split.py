@@ -36,7 +36,7 @@ from gsx.core.training.backbone import Backbone, BackboneContext, DrawnSplats
 from gsx.core.training.parameter_table import size_of
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.compose import compose
-from gsx.experiments.runs.settings import read_config, write_config
+from gsx.experiments.runs.saved_settings import read_config, write_config
 from gsx.formats.ply import read_ply
 from gsx.formats.splat_files import write_columns
 

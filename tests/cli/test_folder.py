@@ -17,13 +17,13 @@ from synthetic_colmap import synthesize, write_photos, write_scene
 
 from gsx.builtin import plugins
 from gsx.cli import folder as folders
-from gsx.cli.arguments import is_override
 from gsx.cli.dispatch import main
 from gsx.core.data.images import write_image
 from gsx.core.errors import InputError
 from gsx.experiments.runs import video
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.orbit import write_animation
+from gsx.experiments.runs.overrides import is_override
 from gsx.experiments.runs.video import photos_of, sharpest, sharpness
 from gsx.scenes.photos import find_photos
 

@@ -15,7 +15,8 @@ from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.evaluator import EvalOptions
 from gsx.experiments.run_folder.general_options import GeneralOptions
 from gsx.experiments.runs.compose import compose
-from gsx.experiments.runs.settings import Budget, typed
+from gsx.experiments.runs.settings import Budget
+from gsx.experiments.runs.typed import typed
 from gsx.experiments.tables.plan import Experiment
 
 GENERAL = [GeneralOptions, TrainingOptions, EvalOptions, RasterSettings, Budget, Checks, Experiment]

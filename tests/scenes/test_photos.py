@@ -21,7 +21,7 @@ from gsx.core.data.images import image_size, read_image, write_image
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
 from gsx.engine.cache import enlist
-from gsx.experiments.runs.settings import typed
+from gsx.experiments.runs.typed import typed
 from gsx.scenes import photos, sfm
 from gsx.scenes.orientation import AFTER_MIRROR, oriented, oriented_camera
 from gsx.scenes.photos import PhotosOptions, find_photos, load, reconstruct

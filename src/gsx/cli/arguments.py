@@ -1,7 +1,6 @@
 """Parsers of verbs, whose mistakes are errors of ours."""
 
 import argparse
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -11,13 +10,6 @@ from gsx.core.ranges import Range
 
 RESUME_FLAGS = ("--trust", "--changed")
 """Of gsx resume."""
-
-
-def is_override(word: str) -> bool:
-    """Return whether a word is a flag or changes the configuration; a path (`./a=b`, or `a=b` that exists) does not."""
-    if word.startswith((".", "/", "~/")):
-        return False
-    return word.startswith(("-", "+", "~")) or ("=" in word and not os.path.exists(word))
 
 
 PLACES = ("output", "folder", "reuse")
@@ -95,10 +87,6 @@ def different_numbers(word: str) -> list[int]:
     if not all(part.isdecimal() for part in parts) or len(set(parts)) < len(parts):
         raise argparse.ArgumentTypeError(f"'{word}' is no list of different whole numbers: give one, for example 0,1,2")
     return [int(part) for part in parts]
-
-
-ZOOMS = Range(1 / 64, 64)
-"""Times a resolution, as eval.zoom."""
 
 
 def refuse_beyond(flag: str, value: float, bounds: Range) -> None:

@@ -39,8 +39,8 @@ def scene_words(path: Path, overrides: Sequence[str], loaded: Plugins) -> list[s
     Raises:
         InputError: it is none; of a splat file the message says what can be done with it.
     """
-    from gsx.experiments.runs.compose import word_of
     from gsx.experiments.runs.inspect import readable, refuse_run, refuse_splats, unknown
+    from gsx.experiments.runs.overrides import word_of
     from gsx.experiments.runs.video import is_video, photos_of
 
     refuse_run(path)

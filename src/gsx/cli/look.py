@@ -55,12 +55,12 @@ def verb_datasets(arguments: list[str]) -> int:
     parser.add_argument("words", nargs="*", metavar="NAME", help="datasets (all)")
     arguments = parser.parse_args(arguments).words
     with loading():
-        from gsx.experiments.runs.compose import Compositions
+        from gsx.experiments.runs.compose import Compositions, listed
         from gsx.experiments.tables.datasets import described
 
     overrides = [word for word in arguments if "=" in word]
     with Compositions(plugins()) as compositions:
-        known = [name for name in compositions.choices("dataset") if name != "own"]
+        known = [name for name in listed("dataset") if name != "own"]
         names = [word for word in arguments if word not in overrides] or known
         for name in names:
             if name not in known:

@@ -1,13 +1,12 @@
 """What people read: errors as one sentence, messages of the log."""
 
 import errno
-import logging
 import os
 import select
 import sys
 
 from gsx.core.errors import GsxError
-from gsx.engine.processes import say, speaks
+from gsx.engine.processes import say
 from gsx.experiments.runs.job import INTERRUPTED
 
 
@@ -90,20 +89,3 @@ def byte_or_escape(letter: str) -> bytes:
     """A byte that Python took for no text (PEP 383), or the escape of a letter."""
     number = ord(letter) - 0xDC00
     return bytes([number]) if 0x80 <= number <= 0xFF else letter.encode("ascii", "backslashreplace")
-
-
-def set_up_logging() -> None:
-    """Plain messages of gsx on standard error, warnings marked."""
-
-    class Plain(logging.Formatter):
-        def format(self, record: logging.LogRecord) -> str:
-            mark = f"{record.levelname.lower()}: " if record.levelno > logging.INFO else ""
-            return mark + record.getMessage()
-
-    root = logging.getLogger("gsx")
-    root.setLevel(logging.INFO)
-    root.propagate = False
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(Plain())
-    handler.handleError = lambda record: None  # type: ignore[method-assign]  # a message that nobody can be told is none
-    root.handlers = [handler] if speaks() else [logging.NullHandler()]

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import ZOOMS, Parser, positive, refuse_beyond, run_arguments, whole
+from gsx.cli.arguments import Parser, positive, refuse_beyond, run_arguments, whole
 from gsx.cli.train import tell_report
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.ranges import Range
+from gsx.core.ranges import ZOOMS, Range
 from gsx.engine.collector import loading
 from gsx.experiments.runs.job import train
 from gsx.formats.axis_names import AUTO, CHOICES, SPECIFIED, TRAINED

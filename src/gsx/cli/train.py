@@ -10,11 +10,12 @@ from typing import Any
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import RESUME_FLAGS, run_arguments
-from gsx.cli.messages import complain, os_sentence, set_up_logging
+from gsx.cli.messages import complain, os_sentence
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
 from gsx.engine.collector import loading
 from gsx.engine.processes import say, speaks
 from gsx.experiments.runs.job import INTERRUPTED, carry_out, train
+from gsx.experiments.runs.messages import set_up_logging
 
 logger = logging.getLogger("gsx.cli")
 
@@ -77,8 +78,9 @@ def fill_table(arguments: list[str]) -> int:
 def hand_to_hydra(arguments: list[str]) -> int:
     """Multirun, completion and information flags, by Hydra's own command line; a multirun ends with one report."""
     with loading():
-        from gsx.experiments.runs.compose import check_overrides, hydra_main, launch, quoted, with_quoted_paths
         from gsx.experiments.runs.launched import waiting_for_all
+        from gsx.experiments.runs.multirun import check_overrides, hydra_main, launch
+        from gsx.experiments.runs.overrides import quoted, with_quoted_paths
         from gsx.experiments.tables.sweep import is_table
 
     if is_table(arguments) and {"-m", "--multirun"} & set(arguments):
@@ -145,8 +147,8 @@ def sweep_job(config: Any) -> int:
     An error is shown and does not end the others; Ctrl-C does, where a launcher's processes are in the end of all.
     """
     from gsx.core.files import write_json
-    from gsx.experiments.runs.compose import job_place
     from gsx.experiments.runs.launched import ended_from_without, is_launched
+    from gsx.experiments.runs.multirun import job_place
     from gsx.experiments.runs.settings import settings_from
 
     set_up_logging()
@@ -189,7 +191,7 @@ def verb_resume(arguments: list[str]) -> int:
         from gsx.experiments.run_folder.files import read_run, reported, state_of
         from gsx.experiments.runs.history import go_on
         from gsx.experiments.runs.open import open_run, refuse_other
-        from gsx.experiments.runs.settings import write_config
+        from gsx.experiments.runs.saved_settings import write_config
 
     loaded = plugins()
     refuse_other(folder)

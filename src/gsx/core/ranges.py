@@ -45,6 +45,8 @@ Seconds = Annotated[float, Range(0, 10**9)]
 Gigabytes = Annotated[float, Range(0, 10**6)]
 """10^9 bytes."""
 Seed = Annotated[int, Range(0, LARGEST_SEED)]
+ZOOMS = Range(1 / 64, 64)
+"""Times a resolution."""
 
 
 def beyond_range(options: type, values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any, Range]]:

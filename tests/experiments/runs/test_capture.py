@@ -22,7 +22,7 @@ from gsx.experiments.runs.capture import (
     ring_line,
     shared,
 )
-from gsx.experiments.runs.settings import typed
+from gsx.experiments.runs.typed import typed
 from gsx.scenes.demo import DemoOptions, load
 
 

@@ -13,7 +13,9 @@ from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
 from gsx.experiments.evaluation.evaluator import EvalOptions
 from gsx.experiments.runs.compose import Compositions, compose, compose_raw
-from gsx.experiments.runs.settings import Settings, read_config, typed, write_config
+from gsx.experiments.runs.saved_settings import read_config, write_config
+from gsx.experiments.runs.settings import Settings
+from gsx.experiments.runs.typed import typed
 from gsx.scenes.options import SceneOptions
 
 CONF = Path(__file__).parents[3] / "conf"
@@ -202,7 +204,7 @@ def test_common_scene_defaults_agree_with_the_schema() -> None:
         (["scene.pth=x"], "'scene.pth' is no configuration key. Did you mean 'scene.path'"),
         (["itterations=5"], "'itterations' is no configuration key. Did you mean 'iterations'"),
         (["+steps=5"], "'steps' is no configuration key"),
-        (["trunk_gb=5"], "'trunk_gb' is no configuration key. It is now called 'disk_cache_gb'"),
+        (["trunk_gb=5"], "'trunk_gb' is no configuration key. It has been removed"),
         (["backbone.rates.sh_constant=1"], "It is now called 'backbone.rates.sh_dc'"),
         (["init=trunk"], "choose scratch, warm_start, or a splat file"),
         (["+backbone.rates.mean_first=1"], "'backbone.rates.mean_first'.*Did you mean 'backbone.rates.means_first'"),

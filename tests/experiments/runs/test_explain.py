@@ -11,7 +11,7 @@ from gsx.cli.dispatch import main
 from gsx.core.errors import ConfigError
 from gsx.experiments.runs.compose import Compositions
 from gsx.experiments.runs.explain import entries, explain, parsed, value_at
-from gsx.experiments.runs.settings import dotted
+from gsx.experiments.runs.typed import dotted
 
 CONF = Path(__file__).parents[3] / "conf"
 

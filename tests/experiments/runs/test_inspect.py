@@ -11,8 +11,9 @@ from synthetic_colmap import synthesize, write_photos, write_scene
 
 from gsx.builtin import plugins
 from gsx.core.data.images import write_image
-from gsx.experiments.runs.compose import compose_raw, hydra_session, word_of
+from gsx.experiments.runs.compose import compose_raw, hydra_session
 from gsx.experiments.runs.inspect import describe, readable, training_command
+from gsx.experiments.runs.overrides import word_of
 from gsx.scenes import colmap, photos
 
 POSE = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]

@@ -88,7 +88,7 @@ def test_threads_hear_no_signals(tmp_path: Path) -> None:
 def test_there_are_no_more_processes_than_jobs() -> None:
     """They would share the cores, and be idle."""
     pytest.importorskip("joblib", reason="gsx[sweep] is not installed")
-    from gsx.experiments.runs.compose import processes_for  # the processes of the first test would import it
+    from gsx.experiments.runs.multirun import processes_for  # the processes of the first test would import it
 
     assert [processes_for(3, 8), processes_for(8, 3), processes_for(1, -1)] == [3, 3, 1]
 

@@ -15,7 +15,7 @@ from gsx.core.ranges import Range
 from gsx.experiments.run_folder.run_key import composition_key
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.explain import explain
-from gsx.experiments.runs.settings import read_config, write_config
+from gsx.experiments.runs.saved_settings import read_config, write_config
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from gsx.experiments.run_folder.run_key import composition_key, evaluation_setti
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.evaluate import evaluate
 from gsx.experiments.runs.open import open_run
-from gsx.experiments.runs.settings import read_config, write_config
+from gsx.experiments.runs.saved_settings import read_config, write_config
 
 OLD = Path(__file__).parents[2] / "old_run"
 

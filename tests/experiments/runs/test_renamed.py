@@ -11,7 +11,7 @@ from gsx.experiments.run_folder import renamed, run_key
 from gsx.experiments.run_folder.renamed import MOVED, RENAMED, moved
 from gsx.experiments.run_folder.run_key import by_older_keys, composition_key
 from gsx.experiments.runs.compose import compose
-from gsx.experiments.runs.settings import read_config
+from gsx.experiments.runs.saved_settings import read_config
 
 CONFIGS = Path(__file__).parents[2] / "old_configs"
 DIGESTS = {"plain": "f83de8aa37b6b3c3", "corrected": "496e7eeba0a8760c"}

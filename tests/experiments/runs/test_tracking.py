@@ -25,7 +25,7 @@ from gsx.experiments.run_folder.run_key import comparable
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
-from gsx.experiments.runs.settings import read_config, write_config
+from gsx.experiments.runs.saved_settings import read_config, write_config
 from gsx.experiments.runs.tracking import Tracking, build_trackers
 from gsx.experiments.runs.warm_start import warm_start_folder
 from gsx.trackers.figures import evaluation_figures, line_figures

@@ -13,7 +13,7 @@ from gsx.core.training.run import Run
 from gsx.engine.cache import in_use
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
-from gsx.experiments.runs.settings import read_config
+from gsx.experiments.runs.saved_settings import read_config
 from gsx.experiments.runs.warm_start import warm_start_folder, without_augmenters
 
 RUN = ("iterations=40", "regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager",

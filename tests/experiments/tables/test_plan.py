@@ -20,7 +20,8 @@ from gsx.experiments.run_folder.run_key import (
     scene_stamp,
 )
 from gsx.experiments.runs.compose import Compositions, compose
-from gsx.experiments.runs.settings import Settings, write_config
+from gsx.experiments.runs.saved_settings import write_config
+from gsx.experiments.runs.settings import Settings
 from gsx.experiments.tables.plan import Cell, Experiment, cells_of, plan_lines, planned
 from gsx.experiments.tables.sweep import experiment_of, protocol_of, run_table
 

@@ -7,7 +7,7 @@ import pytest
 
 from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
-from gsx.experiments.runs.compose import Compositions
+from gsx.experiments.runs.compose import Compositions, listed
 from gsx.experiments.tables.published import METRICS, Published, read_table, tables
 
 TRANSCRIBED = Path(__file__).parents[4] / "shared" / "specs" / "paper_tables"
@@ -42,7 +42,7 @@ def test_figures_known_by_heart() -> None:
 def experiments() -> dict[str, dict]:
     """Every experiment that ships."""
     with Compositions(plugins()) as compositions:
-        names = compositions.choices("experiment")
+        names = listed("experiment")
         return {name: compositions.node([f"+experiment={name}"], "experiment") for name in names}
 
 
@@ -53,8 +53,8 @@ def covered(table: Published, node: dict) -> set[str]:
 
 def test_every_row_of_every_table_has_a_variant_or_a_reason() -> None:
     of_tables = {node["published"]: node for node in experiments().values()}
-    with Compositions(plugins()) as compositions:
-        variants = compositions.choices("variant")
+    with Compositions(plugins()):
+        variants = listed("variant")
     for name in tables():
         node = of_tables[name]
         assert covered(read_table(name), node) == set(read_table(name).methods), name

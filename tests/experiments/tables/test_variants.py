@@ -11,7 +11,7 @@ from gsx.builtin import plugins
 from gsx.core.training.augmenter import Foretold
 from gsx.core.training.run import Run
 from gsx.experiments.run_folder.run_key import composition_key
-from gsx.experiments.runs.compose import Compositions
+from gsx.experiments.runs.compose import Compositions, listed
 from gsx.experiments.runs.open import start
 from gsx.experiments.runs.settings import Settings
 
@@ -96,7 +96,7 @@ OTHERS: dict[str, dict[str, Any]] = {
 def composed() -> dict[str, Settings]:
     """Every variant on one scene of its own."""
     with Compositions(plugins()) as compositions:
-        return {name: compositions.settings([f"variant={name}"]) for name in compositions.choices("variant")}
+        return {name: compositions.settings([f"variant={name}"]) for name in listed("variant")}
 
 
 def at(config: dict[str, Any], key: str) -> Any:

@@ -39,7 +39,8 @@ from gsx.experiments.runs.file_axes import start_in_scene
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import as_trained, open_run, refuse_used
 from gsx.experiments.runs.rasterizer_path import warm
-from gsx.experiments.runs.settings import Settings, write_config
+from gsx.experiments.runs.saved_settings import write_config
+from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import composition_of, starting_splats
 from gsx.experiments.runs.verified import verified
 from gsx.formats.suffixes import STANDARD

@@ -14,8 +14,9 @@ from gsx.core.errors import ConfigError
 from gsx.core.plugins import Plugins
 from gsx.core.ranges import Range, parts_of
 from gsx.experiments.run_folder.general_options import GeneralOptions
-from gsx.experiments.runs.compose import Compositions, Source
-from gsx.experiments.runs.settings import Settings, dotted, right_key
+from gsx.experiments.runs.compose import Compositions, Source, known_groups, listed
+from gsx.experiments.runs.settings import Settings
+from gsx.experiments.runs.typed import dotted, right_key
 
 KINDS = {int: "whole number", float: "number", str: "text", bool: "true or false", Path: "path"}
 WIDTH = 110
@@ -54,7 +55,7 @@ def explain(key: str, overrides: Sequence[str], plugins: Plugins) -> list[str]:
     with Compositions(plugins) as compositions:
         if option:
             overrides, key = [*overrides, key], group
-        values, groups = compositions.values(overrides), compositions.groups()
+        values, groups = compositions.values(overrides), known_groups()
         known = dict.fromkeys([*dotted(values), *groups])
         if key not in known:
             raise ConfigError(f"'{key}' is no configuration key.{right_key(key, known)} `gsx --cfg job` lists all keys")
@@ -79,7 +80,7 @@ def options_of(group: str, compositions: Compositions, files: Sequence[Parsed]) 
     """Options of a group, a line each; those of the composition are marked."""
     chosen = {file.source.file for file in files}
     lines = []
-    for name in compositions.choices(group):
+    for name in listed(group):
         file = compositions.file(f"{group}/{name}")
         lines.append(f"{'*' if file in chosen else ' '} {name:24} {head_of(file)}".rstrip())
     return lines
@@ -253,10 +254,10 @@ def reference(plugins: Plugins) -> list[str]:
         "`gsx KEY=VALUE`, `gsx GROUP=OPTION`, `gsx explain KEY`.",
     ]
     with Compositions(plugins) as compositions:
-        groups = [group for group in compositions.groups() if compositions.choices(group)]
+        groups = [group for group in known_groups() if listed(group)]
         lines += ["", "## Of a run", "", *keys_table("", [], compositions, groups)]
         for group in filter(LISTED.__contains__, groups):
-            for option in compositions.choices(group):
+            for option in listed(group):
                 word = f"{group}=[{option}]" if group in SEVERAL else f"{group}={option}"
                 lines += ["", f"## {word}", "", head_of(compositions.file(f"{group}/{option}")) + ".", ""]
                 prefix = f"{SEVERAL[group]}.{option}" if group in SEVERAL else group.replace("/", ".")

@@ -18,7 +18,8 @@ from gsx.core.training.run import Run
 from gsx.experiments.run_folder.files import RunFiles, part, read_run
 from gsx.experiments.run_folder.run_key import composition_key, trained
 from gsx.experiments.runs.environment import environment
-from gsx.experiments.runs.settings import Settings, read_config
+from gsx.experiments.runs.saved_settings import read_config
+from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""A run from settings to its end as a program carries it out: signals, log file, what is said at the end."""
+"""A run from settings to its end as a program carries it out: signals, log file, and how to go on."""
 
 import logging
 import signal
@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 from gsx.core.errors import ConfigError, command
 from gsx.core.files import remove_partial
 from gsx.engine.cache import in_use
-from gsx.engine.processes import processes, say, speaks
+from gsx.engine.processes import processes, say
 from gsx.engine.signals import STOPPING, handled_signals
+from gsx.experiments.runs.messages import logged_to
 
 if TYPE_CHECKING:
     from gsx.core.plugins import Plugins
@@ -26,34 +27,15 @@ INTERRUPTED = 130
 
 
 @contextmanager
-def logged_to(folder: Path) -> Iterator[None]:
-    """Also write messages to the run's log.txt."""
-    if not speaks():
-        yield
-        return
-    handler = logging.FileHandler(folder / "log.txt", encoding="utf-8", errors="backslashreplace")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    handler.handleError = lambda record: None  # type: ignore[method-assign]  # a full disk is reported once, elsewhere
-    root = logging.getLogger("gsx")
-    if root.level == logging.NOTSET:  # from Python, where nobody has asked for messages
-        root.setLevel(logging.INFO)
-    root.addHandler(handler)
-    try:
-        yield
-    finally:
-        root.removeHandler(handler)
-        handler.close()
-
-
-@contextmanager
 def interruptible(run: "Run", onwards: str) -> Iterator[object]:
-    """The first Ctrl-C ends training after the current step; a second one, or one after training, ends the program.
+    """Ends training after the current step at the first Ctrl-C, and the program at a second, or after training.
 
     The signals by which a cluster takes a machine back (STOPPING) end training, too; they may come again until the
     checkpoint is written. Then the first is sent again, to whoever waited for it before; the log says how to go
-    `onwards`.
+    `onwards`. Threads but the main one hear no signals.
 
-    Yields a listener that takes the handlers away when training is over. Threads but the main one hear no signals.
+    Yields:
+        A listener that restores the handlers when training is over.
     """
     from gsx.core.plugins import hookimpl
 
@@ -87,7 +69,7 @@ def interruptible(run: "Run", onwards: str) -> Iterator[object]:
 
 
 def train(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
-    """Train one composed experiment in a new folder, or go on in that of its composition; `folders` learns which.
+    """Trains one composed experiment in a new folder, or goes on in that of its composition; `folders` learns which.
 
     Returns 0, or INTERRUPTED where it was stopped before its end.
     """
@@ -102,7 +84,7 @@ def train(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
 
 
 def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
-    """Train what is left of a composition in its own folder."""
+    """Trains what is left of a composition in its own folder; see `train`."""
     from gsx.experiments.run_folder.claims import claimed_name
     from gsx.experiments.run_folder.run_key import place_of, scene_stamp
     from gsx.experiments.runs.open import resume_or_start
@@ -113,7 +95,7 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     folder = place_of(settings.resolved, stamp, settings.idle)
     folders.append(folder)
     with in_use(), claimed_name(folder), ExitStack() as claims:
-        _, run = resume_or_start(settings, loaded, stamp, claims)
+        run = resume_or_start(settings, loaded, stamp, claims)
         if run is None:
             tidied(folder)
             return 0
@@ -121,9 +103,9 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
 
 
 def tidied(folder: Path) -> None:
-    """Finish what a process left of a finished run that was killed at its very end: partial files, no report.
+    """Finishes what a process left of a finished run that was killed at its very end: partial files, no report.
 
-    To be called with the folder's name claimed.
+    The folder's name must be claimed.
     """
     from gsx.experiments.reports.report import write_report
     from gsx.experiments.run_folder.claims import claimed
@@ -138,23 +120,16 @@ def tidied(folder: Path) -> None:
 def carry_out(run: "Run", settings: "Settings", loaded: "Plugins", keep_states: bool = False) -> int:
     """Trains to the end or to Ctrl-C, and says then how to go on; `keep_states`: see `execute`."""
     from gsx.experiments.runs.execute import execute
-
-    onwards = way_on(run, settings)
-    try:
-        with interruptible(run, onwards) as listener, loaded.listening([listener]), logged_to(run.folder):
-            execute(run, settings, loaded, keep_states)
-    except KeyboardInterrupt:
-        say(f"\ngsx: interrupted after step {run.step}; go on with: {onwards}\n", as_error=True)
-        return INTERRUPTED
-    if not run.complete:
-        say(f"gsx: stopped at step {run.step}; go on with: {onwards}\n", as_error=True)
-        return INTERRUPTED
-    return 0
-
-
-def way_on(run: "Run", settings: "Settings") -> str:
-    """The command that goes on with a run; one that is named by its composition is found again by it."""
     from gsx.experiments.runs.settings import named_code
 
     trust = ["--trust"] if named_code(settings) else []
-    return "the same command" if settings.general.reuse else command("resume", run.folder, *trust)
+    onwards = "the same command" if settings.general.reuse else command("resume", run.folder, *trust)
+    try:
+        with interruptible(run, onwards) as listener, loaded.listening([listener]), logged_to(run.folder):
+            execute(run, settings, loaded, keep_states)
+        if run.complete:
+            return 0
+        say(f"gsx: stopped at step {run.step}; go on with: {onwards}\n", as_error=True)
+    except KeyboardInterrupt:
+        say(f"\ngsx: interrupted after step {run.step}; go on with: {onwards}\n", as_error=True)
+    return INTERRUPTED

@@ -31,14 +31,15 @@ from gsx.experiments.run_folder.run_key import (
 )
 from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.build import build, choose_device, prepare_compiling, refuse_uneven
-from gsx.experiments.runs.compose import key_of
 from gsx.experiments.runs.environment import environment
 from gsx.experiments.runs.file_axes import start_in_scene
 from gsx.experiments.runs.history import go_on
 from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.overrides import key_of
 from gsx.experiments.runs.progress import read_curves
 from gsx.experiments.runs.rasterizer_path import help_at_once
-from gsx.experiments.runs.settings import Settings, named_code, read_config, value_of, write_config
+from gsx.experiments.runs.saved_settings import read_config, value_of, write_config
+from gsx.experiments.runs.settings import Settings, named_code
 from gsx.experiments.runs.start_file import starting_splats
 from gsx.experiments.runs.tracking import build_trackers
 from gsx.experiments.runs.verified import verified
@@ -209,13 +210,11 @@ def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     return run
 
 
-def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: ExitStack) -> tuple[Path, Run | None]:
-    """The folder of a composition, and its run as far as it has come; no run if there is nothing left to do.
+def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: ExitStack) -> Run | None:
+    """Returns the run of a composition as far as it has come; None: it is finished. `stamp`: of its scene.
 
-    `stamp`: of its scene.
-
-    What was finished is not done again, what was interrupted goes on where it stopped, and what was judged otherwise is
-    judged anew. To be called with the folder's name claimed (`claimed_name`); the folder is, as long as `claims` lasts.
+    What was evaluated by other settings is evaluated anew. The folder's name must be claimed (`claimed_name`); the
+    folder is, as long as `claims` lasts.
 
     Raises:
         ConfigError, InputError: something is wrong; no folder was made.
@@ -225,7 +224,7 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: Ex
     if finished(files, settings.resolved, stamp, settings.idle):
         lost = f", {', '.join(files.lost)} lost since" if files.lost else ""
         logger.info("finished earlier%s%s: %s", by_another(files), lost, folder)
-        return folder, None
+        return None
     at_hand = replace(settings, general=replace(settings.general, folder=str(folder), reuse=False))
     try:
         with ExitStack() as claim:
@@ -235,11 +234,11 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: Ex
             claims.push(claim.pop_all())
     except CheckpointError as error:
         set_aside(folder, str(error))
-        return folder, start(at_hand, plugins, claims)
+        return start(at_hand, plugins, claims)
     logger.info("going on with %s at step %d", folder, run.step)
     go_on(run, settings, plugins, changed=True)
     write_config(folder / "config.yaml", settings.resolved)
-    return folder, run
+    return run
 
 
 def gone_on_with(folder: Path, files: RunFiles, settings: Settings, stamp: str) -> Run:

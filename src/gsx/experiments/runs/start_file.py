@@ -17,7 +17,7 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Float
 from gsx.core.training.backbone import Backbone, FromGaussians
 from gsx.experiments.run_folder.general_options import splat_file
-from gsx.experiments.runs.compose import key_of, quoted
+from gsx.experiments.runs.overrides import key_of, quoted
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_checks import doubts_about
 from gsx.formats.axis_names import AUTO

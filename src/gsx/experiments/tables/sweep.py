@@ -14,9 +14,11 @@ from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.claims import claimed_name, left_behind
 from gsx.experiments.run_folder.files import reported
 from gsx.experiments.run_folder.run_key import sorted_items
-from gsx.experiments.runs.compose import Compositions, key_of, parse_overrides, refuse_absent_slurm
+from gsx.experiments.runs.compose import Compositions
 from gsx.experiments.runs.job import tidied
-from gsx.experiments.runs.settings import typed
+from gsx.experiments.runs.multirun import launch_jobs
+from gsx.experiments.runs.overrides import key_of, parse_overrides, refuse_absent_slurm
+from gsx.experiments.runs.typed import typed
 from gsx.experiments.tables.datasets import missing
 from gsx.experiments.tables.plan import Cell, Experiment, Plan, cells_of, check_scenes, plan_lines, planned, words_of
 from gsx.experiments.tables.published import read_table
@@ -109,7 +111,7 @@ def launched(
 ) -> None:
     """Carry out a phase. A launcher that gives up, for one killed process perhaps, does not cost the table."""
     try:
-        compositions.launch(overrides, folder, jobs, job)
+        launch_jobs(overrides, folder, jobs, job)
     except Exception as error:
         logger.warning(
             "the launcher gave up (%s: %s): give the same command again for what is missing",

@@ -13,7 +13,8 @@ from gsx.core.files import read_json
 from gsx.core.plugins import Plugins
 from gsx.experiments.evaluation.remarks import NOT_MEASURED, measures_nothing
 from gsx.experiments.reports.page import duration
-from gsx.experiments.runs.compose import compose, quoted
+from gsx.experiments.runs.compose import compose
+from gsx.experiments.runs.overrides import quoted
 from gsx.experiments.trade.training.settings import GIVEN, Setting, together
 
 logger = logging.getLogger(__name__)

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from gsx.core.errors import ConfigError, nearest
 from gsx.core.ranges import Range
-from gsx.experiments.runs.settings import typed
+from gsx.experiments.runs.typed import typed
 
 
 @dataclass(frozen=True, kw_only=True)

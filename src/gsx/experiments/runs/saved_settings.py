@@ -1,0 +1,110 @@
+"""config.yaml of a run folder: written, read back with overrides, and translated from older versions."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from gsx.core.errors import ConfigError, first_line
+from gsx.core.files import replace_text
+from gsx.core.plugins import Plugins
+from gsx.core.rasterizer import RasterSettings
+from gsx.core.rasterizer.settings import OF_BACKBONES
+from gsx.core.training.run import TrainingOptions
+from gsx.experiments.evaluation.evaluator import EvalOptions
+from gsx.experiments.evaluation.lpips import LpipsOptions
+from gsx.experiments.run_folder.files import part
+from gsx.experiments.run_folder.general_options import GeneralOptions
+from gsx.experiments.run_folder.renamed import renamed
+from gsx.experiments.runs.settings import COMPONENT_KINDS, Settings, settings_from, strict_node
+from gsx.experiments.runs.typed import dotted, right_key, schema_keys, texts
+
+
+def write_config(path: Path, resolved: dict[str, Any]) -> None:
+    """Saves a resolved configuration as YAML."""
+    replace_text(path, OmegaConf.to_yaml(OmegaConf.create(resolved)))
+
+
+def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> Settings:
+    """Returns the settings of a run, with `key=value` overrides of its keys and of those that gsx has had since.
+
+    Raises:
+        ConfigError: the file is unreadable, or an override names no such key.
+    """
+    config = with_newer_settings(saved_config(path))
+    for override in overrides:
+        key, equals, value = override.partition("=")
+        if not equals:
+            raise ConfigError(f"'{override}' is given no value: write {override}=VALUE")
+        known = list(dict.fromkeys([*dotted(OmegaConf.to_container(config)), *newer_keys(config, plugins)]))
+        if key not in known:
+            near = right_key(key, known) or " All of them are in that file."
+            raise ConfigError(f"'{key}' is no key of {path}.{near}")
+        try:
+            OmegaConf.update(config, key, value_of(value), force_add=True)
+        except Exception as error:  # the YAML parser has its own family of errors
+            raise ConfigError(f"override '{override}' cannot be read: {first_line(error)}") from error
+    return settings_from(config, plugins)
+
+
+def saved_config(path: Path) -> DictConfig:
+    """Reads a configuration by today's names.
+
+    Raises:
+        ConfigError: it cannot be read, or looks something up: gsx writes plain values, and somebody else's file would
+            learn of this machine's environment.
+    """
+    try:
+        content = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+    except Exception as error:
+        raise ConfigError(f"{path} cannot be read ({first_line(error)}): give the folder of a gsx run") from error
+    for key, text in texts(content):
+        if "${" in text:
+            raise ConfigError(f"{path}: {key} is '{text}'; a run's configuration holds plain values: write what it is")
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path} holds no configuration: give the folder of a gsx run")
+    return OmegaConf.create(renamed(content))  # type: ignore[arg-type]
+
+
+def newer_keys(config: DictConfig, plugins: Plugins) -> Iterator[str]:
+    """Yields dotted keys that a run's composition may have by today's schemas; an older run's file lacks some."""
+    values: Any = OmegaConf.to_container(config)
+    schemas: dict[str, type] = {"training": TrainingOptions, "eval": EvalOptions, "metrics.lpips": LpipsOptions}
+    schemas |= {f"training.{name}": one.options for name, one in plugins.registry.of("module").items()}
+    nodes = {kind: (kind, part(values, kind)) for kind in COMPONENT_KINDS}
+    for kind in ("augmenter", "regenerator", "tracker"):
+        nodes |= {f"{kind}.{name}": (kind, node) for name, node in part(values, kind).items() if isinstance(node, dict)}
+    schemas |= {
+        key: plugins.registry.find(kind, str(node.get("name", ""))).options for key, (kind, node) in nodes.items()
+    }
+    yield from schema_keys(GeneralOptions)
+    for key, schema in schemas.items():
+        yield from (name for name in schema_keys(schema, f"{key}.") if not name.startswith("eval.lpips"))
+
+
+def value_of(word: str) -> Any:
+    """Returns what a word of the command line stands for, as YAML."""
+    return OmegaConf.select(OmegaConf.create(f"value: {word}"), "value")
+
+
+def with_newer_settings(config: DictConfig) -> DictConfig:
+    """Adds what older runs trained by without a key for it.
+
+    These are defaults of the rasterizer, any number of absent images, strict checks of redrawn pictures; the gate of
+    `clone_split`, which anchors do not have, goes.
+    """
+    if isinstance(config.get("rasterizer"), DictConfig):
+        options = {key: v for key, v in dataclasses.asdict(RasterSettings()).items() if key not in OF_BACKBONES}
+        config.rasterizer = OmegaConf.merge(options, config.rasterizer)
+    if "downscale" in (config.get("scene") or {}) and "missing" not in config.scene:
+        config.scene.missing = 1.0
+    augmenters = config.get("augmenter")
+    for node in augmenters.values() if isinstance(augmenters, DictConfig) else ():
+        if isinstance(node, DictConfig) and {"scales", "weight_map"} <= node.keys() and "checks" not in node:
+            node.checks = strict_node()
+    density = OmegaConf.select(config, "backbone.clone_split.level_density")
+    if isinstance(density, DictConfig) and config.backbone.get("densification") != "clone_split":
+        density.pop("gate", None)
+    return config

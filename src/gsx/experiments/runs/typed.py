@@ -1,0 +1,137 @@
+"""Plain values against typed schemas: dataclasses of options. Mistakes get the nearest match. No Hydra here."""
+
+import copy
+import dataclasses
+import math
+import re
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gsx.core.errors import ConfigError, first_line, nearest
+from gsx.core.ranges import beyond_range
+from gsx.experiments.run_folder.renamed import advice
+
+
+@dataclasses.dataclass(frozen=True)
+class Values:
+    """Plain values; equal where they are written alike, so that 1 is neither 1.0 nor true."""
+
+    plain: Any = dataclasses.field(compare=False)
+    text: str
+
+
+def typed(schema: type, values: Any, path: str) -> Any:
+    """Returns an instance of a dataclass from the plain values at a dotted key.
+
+    Raises:
+        ConfigError: an unknown key or a value of the wrong type; value, key and remedy are named.
+    """
+    return copy.deepcopy(checked(schema, Values(values, repr(values)), path))
+
+
+@lru_cache(maxsize=512)
+def checked(schema: type, given: Values, path: str) -> Any:
+    """Does the same once: most nodes of many compositions are equal."""
+    values = given.plain
+    refuse_not_finite(values, path)
+    try:
+        named = values if isinstance(values, dict) else {}
+        merged = OmegaConf.merge(writable(OmegaConf.structured(schema), named), OmegaConf.create(values or {}))
+        plain: Any = OmegaConf.to_container(merged)
+        for key, value, bounds in beyond_range(schema, plain):
+            raise ConfigError(f"{f'{path}.{key}'.lstrip('.')} is {value}; give a number {bounds}")
+        return OmegaConf.to_object(merged)
+    except OmegaConfBaseException as error:
+        raise ConfigError(complaint(error, schema, path)) from error
+    except ValueError as error:  # a dataclass refused the combination
+        raise ConfigError(str(error)) from error
+
+
+def refuse_not_finite(value: Any, path: str) -> None:
+    """Raises ConfigError for a number that is not finite, anywhere below a key: nan passes every comparison."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            refuse_not_finite(inner, f"{path}.{key}".lstrip("."))
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            refuse_not_finite(inner, path)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{path} is {value}; give a finite number")
+
+
+def writable(node: DictConfig, values: dict[str, Any]) -> DictConfig:
+    """Unlocks the nodes of frozen dataclasses, into which OmegaConf cannot merge; `values`: what will be merged."""
+    OmegaConf.set_readonly(node, False)
+    for key in node:
+        child = node._get_node(key)
+        if isinstance(child, DictConfig):
+            inner = values.get(str(key))
+            absent = child._is_missing() or (child._is_none() and isinstance(inner, dict))
+            if absent and dataclasses.is_dataclass(child._metadata.ref_type):
+                child._set_value(child._metadata.ref_type)  # its fields must be there to be made writable
+            if not child._is_none():
+                writable(child, inner if isinstance(inner, dict) else {})
+    return node
+
+
+def complaint(error: OmegaConfBaseException, schema: type, path: str) -> str:
+    """Returns what is wrong at which key, in one sentence."""
+    inner = str(error.full_key or "")
+    key, text = ".".join(part for part in (path, inner) if part), first_line(error)
+    if type(error).__name__ == "ConfigKeyError":
+        options = [f"{path}.{k}".lstrip(".") for k in schema_keys(schema)]
+        return f"'{key}' is no configuration key.{right_key(key, options)}"
+    if "is not a ListConfig" in text:
+        return f"{key} takes a list: give {key}=[...], with commas between its values"
+    if (group := re.search(r"is not a subclass of (\w+)", text)) is not None:
+        key = ".".join([part for part in (path, key_of_type(schema, group[1])) if part]) or key
+        return f"{key} is no value but a group of settings: give {key}.NAME=VALUE"
+    return f"{key}: {text}"
+
+
+def key_of_type(schema: type, name: str, prefix: str = "") -> str:
+    """Returns the dotted name of the first field that is a dataclass of that name, or an empty text."""
+    for entry in dataclasses.fields(schema):
+        if not dataclasses.is_dataclass(entry.type):
+            continue
+        key = f"{prefix}{entry.name}"
+        if entry.type.__name__ == name:  # type: ignore[union-attr]
+            return key
+        if found := key_of_type(entry.type, name, f"{key}."):  # type: ignore[arg-type]
+            return found
+    return ""
+
+
+def right_key(key: str, known: Iterable[str]) -> str:
+    """Returns ` It is now called 'x'.` for a key of older versions, else ` Did you mean 'x'?` or an empty text."""
+    return advice(key) or nearest(key, known)
+
+
+def schema_keys(schema: type, prefix: str = "") -> Iterator[str]:
+    """Yields dotted field names of a dataclass and of those inside it, with keys of mappings by default."""
+    for entry in dataclasses.fields(schema):
+        yield f"{prefix}{entry.name}"
+        made = entry.default_factory() if entry.default_factory is not dataclasses.MISSING else None
+        yield from (f"{prefix}{entry.name}.{key}" for key in (made if isinstance(made, dict) else ()))
+        if dataclasses.is_dataclass(entry.type):
+            yield from schema_keys(entry.type, f"{prefix}{entry.name}.")  # type: ignore[arg-type]
+
+
+def dotted(node: Any, prefix: str = "") -> Iterator[str]:
+    """Yields dotted paths of all keys, inner nodes included."""
+    for key, value in node.items() if isinstance(node, dict) else ():
+        yield f"{prefix}{key}"
+        yield from dotted(value, f"{prefix}{key}.")
+
+
+def texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """Yields (key, text) of all texts inside nested mappings and lists."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for name, one in inner:
+        yield from texts(one, f"{key}.{name}".lstrip("."))
+    if isinstance(value, str):
+        yield key, value
