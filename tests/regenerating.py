@@ -7,7 +7,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from gsx.augmenters.checked_regenerator import CheckedRegenerator, Checks, Tally
+from gsx.augmenters.checks import Checks
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.core.data.camera import Camera, look_at
@@ -85,14 +85,11 @@ def through_an_autoencoder(request: Request) -> Tensor:
 
 def noisy(options: PseudoOptions, name: str, run: Run) -> PseudoDetails:
     """An augmenter by these options on the scene of a run, redrawn through an autoencoder."""
-    made = of_role(Made(through_an_autoencoder), options.checks, name)
-    context = AugmenterContext(name=name, scene=run.scene, iterations=40000, seed=0, regenerator=made)
+    regenerator = of_role(Made(through_an_autoencoder))
+    context = AugmenterContext(name=name, scene=run.scene, iterations=40000, seed=0, regenerator=regenerator)
     return PseudoDetails(options, context)
 
 
-def of_role(made: Regenerator, checks: Checks, name: str = "upscale") -> Callable[[str], CheckedRegenerator]:
-    """What a context hands out: this regenerator for every role."""
-    checked = CheckedRegenerator(
-        inner=made, checks=checks, tally=Tally(name=name, remedies=["choose another regenerator/upscale"])
-    )
-    return lambda role: checked
+def of_role(regenerator: Regenerator) -> Callable[[str], Regenerator]:
+    """Returns what a context holds: this regenerator for every role."""
+    return lambda role: regenerator

@@ -2,26 +2,20 @@
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from regenerating import Made, request, strict_checks
 from torch import Tensor
 
-from gsx.augmenters.checked_regenerator import (
-    LARGEST_DRIFT,
-    Check,
-    CheckedRegenerator,
-    Tally,
-    added_accounts,
-    colour_matched,
-    displacement,
-    strayed,
-    unusable,
-)
+from gsx.augmenters.checked_regenerator import CheckedRegenerator, Redrawing, Tally
+from gsx.augmenters.checks import LARGEST_DRIFT, Check, defect, displacement, match_colour, violations
 from gsx.core.data.reduction import Reduction, as_blocks, box_average
 from gsx.core.data.resize import resize, to_uint8
 from gsx.core.errors import TrainingError
+from gsx.core.training.augmenter import recall_accounts
+from gsx.core.training.minibatch import merge_accounts
 from gsx.core.training.regenerator import Request
 
 STRICT = strict_checks()
@@ -30,7 +24,7 @@ BICUBIC = Reduction(filter="bicubic")
 
 def complaint(asked: Request, result: Tensor) -> str:
     """Everything that is wrong with a result by the strict checks."""
-    return unusable(asked, result) or "; ".join(strayed(asked, result, STRICT).values())
+    return defect(asked, result) or "; ".join(violations(asked, result, STRICT).values())
 
 
 def texture(height: int = 40, width: int = 50, shift: float = 0.0) -> Tensor:
@@ -75,8 +69,8 @@ def test_pictures_are_reduced_as_the_scene_reduces_them() -> None:
     photo = to_uint8(0.3 + 0.4 * bars.expand(3, -1, -1))
     given = request(resize(photo, 80, 60).float() / 255)
     strict = replace(STRICT, agreement=Check(limit=50.0, action="drop"))
-    assert strayed(replace(given, reduction=BICUBIC), photo.float() / 255, strict) == {}
-    assert "agreement" in strayed(given, photo.float() / 255, strict)
+    assert violations(replace(given, reduction=BICUBIC), photo.float() / 255, strict) == {}
+    assert "agreement" in violations(given, photo.float() / 255, strict)
 
 
 def test_a_window_is_not_held_to_what_lay_beyond_it() -> None:
@@ -85,10 +79,10 @@ def test_a_window_is_not_held_to_what_lay_beyond_it() -> None:
     low = BICUBIC.reduce(bars, 2)[:, 10:30, 20:44]
     result = bars[:, 20:60, 40:88]
     strict = replace(STRICT, agreement=Check(limit=90.0, action="drop"))
-    assert strayed(replace(request(low), reduction=BICUBIC), result, strict) == {}
+    assert violations(replace(request(low), reduction=BICUBIC), result, strict) == {}
     off = low.clone()
     off[:, 5, 5] += 0.01
-    assert "agreement" in strayed(replace(request(off), reduction=BICUBIC), result, strict)
+    assert "agreement" in violations(replace(request(off), reduction=BICUBIC), result, strict)
 
 
 def test_half_a_pixel_of_the_finer_raster_is_the_limit() -> None:
@@ -116,21 +110,21 @@ def test_limits_are_options() -> None:
 
     def found(agreement: float, colour: float) -> list[str]:
         limits = {"agreement": Check(limit=agreement, action="warn"), "colour": Check(limit=colour, action="drop")}
-        return list(strayed(asked, result, replace(STRICT, **limits)))
+        return list(violations(asked, result, replace(STRICT, **limits)))
 
     assert found(26.03, 12.8) == ["agreement"]
     assert found(26.01, 12.7) == ["colour"]
     assert found(26.01, 12.8) == []
     off = Check(limit=0.0, action="off")
-    assert strayed(asked, result, replace(STRICT, agreement=off, colour=off)) == {}
+    assert violations(asked, result, replace(STRICT, agreement=off, colour=off)) == {}
     with pytest.raises(ValueError, match="'loud'; choose drop, warn or off"):
         Check(limit=1.0, action="loud")
 
 
 def test_colours_are_put_right_where_they_drift() -> None:
     given = request(texture())
-    assert torch.equal(colour_matched(given, fine() + 1 / 255), fine() + 1 / 255)
-    matched = colour_matched(given, fine() + torch.tensor([0.1, 0.0, -0.05])[:, None, None])
+    assert torch.equal(match_colour(given, fine() + 1 / 255), fine() + 1 / 255)
+    matched = match_colour(given, fine() + torch.tensor([0.1, 0.0, -0.05])[:, None, None])
     torch.testing.assert_close(matched.mean((1, 2)), texture().mean((1, 2)))
 
 
@@ -139,9 +133,9 @@ def test_a_picture_that_reduces_to_its_input_in_light_keeps_its_colour() -> None
     stripes, light = (torch.arange(24) % 2).float().expand(3, 24, 24).contiguous(), Reduction(light="linear")
     given = replace(request(light.reduce(stripes, 2)), reduction=light)
     assert float(given.image.mean() - stripes.mean()) > 0.2
-    assert torch.equal(colour_matched(given, stripes), stripes)
+    assert torch.equal(match_colour(given, stripes), stripes)
     for factor in (0.9, 0.8):
-        matched = colour_matched(given, factor * stripes)
+        matched = match_colour(given, factor * stripes)
         assert float((light.reduce(matched, 2) - given.image).mean().abs()) <= LARGEST_DRIFT
 
 
@@ -194,15 +188,33 @@ def test_one_bad_picture_among_those_asked_for_now_and_then_ends_nothing() -> No
         regenerator.tally.account_at(9)
 
 
+class Mine(Redrawing):
+    """An augmenter that redraws pictures and nothing else."""
+
+    def __init__(self) -> None:
+        self.regenerator = checked(lambda asked: asked.image)
+
+    def term(self, run: Any, step: int, view: int) -> None:
+        return None
+
+    def begins(self) -> int:
+        return 0
+
+    def plan(self) -> dict[str, Any]:
+        return {}
+
+
 def test_accounts_of_processes_add_up_and_outlive_an_interruption() -> None:
     first = {"mine": {"event": 3, "asked": {"1": 2, "2": 2}, "dropped": {"2": 1}, "warned": {"colour": {"1": 1}}}}
     second = {"mine": {"event": 3, "asked": {"2": 6}, "dropped": {"2": 2}, "warned": {"colour": {"2": 3}}}}
-    total = added_accounts([first, second, {}])
+    total = merge_accounts([first, second, {}])
     assert total == {
         "mine": {"event": 3, "asked": {"1": 2, "2": 8}, "dropped": {"2": 3}, "warned": {"colour": {"1": 1, "2": 3}}}
     }
-    tally = Tally(name="mine")
-    tally.recall([{"step": 4, "pseudo": total}, {"step": 5}, {"step": 6, "pseudo": {"other": {}}}])
+    lines = [{"step": 4, "pseudo": total}, {"step": 5}, {"step": 6, "pseudo": {"other": {}}}]
+    augmenter = Mine()
+    recall_accounts({"mine": augmenter}, lines)
+    tally = augmenter.regenerator.tally
     assert (tally.asked, tally.dropped) == ({"1": 2, "2": 8}, {"2": 3})
 
 

@@ -28,7 +28,7 @@ def by_hand(run: Run, enlarge: Callable[[Request], Tensor], **changes: Any) -> P
     """The run's first augmenter with a regenerator made of a function."""
     old = augmenter_of(run)
     options = replace(old.options, **changes)
-    return PseudoDetails(options, replace(old.context, regenerator=of_role(Made(enlarge), options.checks)))
+    return PseudoDetails(options, replace(old.context, regenerator=of_role(Made(enlarge))))
 
 
 # -- every regenerator by what it can do -------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from regenerating import of_role
 from torch import Tensor
 
 from gsx.augmenters import checked_regenerator
-from gsx.augmenters.checked_regenerator import displacement
+from gsx.augmenters.checks import displacement
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
@@ -88,9 +88,9 @@ def trained(folder: Path, pixels: float | None) -> Seen:
     """A run with pseudo views displaced so far; None: without any."""
     run = start(compose([*(CONTROL if pixels is None else AUGMENTED), f"folder={folder}"], plugins()), plugins())
     if pixels is not None:
-        (augmenter,) = run.augmenters
+        (augmenter,) = run.augmenters.values()
         assert isinstance(augmenter, PseudoDetails)
-        context = replace(augmenter.context, regenerator=of_role(Displaced(pixels), augmenter.options.checks))
+        context = replace(augmenter.context, regenerator=of_role(Displaced(pixels)))
         run = replace(run, augmenters=[PseudoDetails(augmenter.options, context)])
     train(run, plugins())
     return seen(run)
@@ -101,7 +101,7 @@ def test_on_training_views_true_pixels_help_the_more_the_closer_and_displaced_on
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Half a pixel of displacement, let through: the checks that would drop it have tests of their own."""
-    monkeypatch.setattr(checked_regenerator, "strayed", lambda request, result, checks: {})
+    monkeypatch.setattr(checked_regenerator, "violations", lambda request, result, checks: {})
     control, perfect, displaced = (
         trained(tmp_path / name, pixels) for name, pixels in (("control", None), ("perfect", 0.0), ("displaced", 0.5))
     )

@@ -12,6 +12,7 @@ from tiny import final_tensors, stopped_at, tiny_run, tiny_settings
 from torch import Tensor
 
 from gsx.augmenters.pseudo_details import PseudoDetails
+from gsx.augmenters.store import load_views, save_views
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import read_image
@@ -21,7 +22,7 @@ from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import rasterize
 from gsx.core.training.augmenter import Augmenter
 from gsx.core.training.parameter_table import gradients, zero_grad
-from gsx.core.training.pseudo_views import PseudoView, Term, load_views, pseudo_loss, save_views
+from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
 from gsx.core.training.regenerator import RegeneratorContext
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -57,7 +58,7 @@ def run_at(folder: Path, step: int, *words: str, **options: Any) -> Run:
 
 
 def augmenter_of(run: Run, number: int = 0) -> PseudoDetails:
-    found = run.augmenters[number]
+    found = list(run.augmenters.values())[number]
     assert isinstance(found, PseudoDetails)
     assert isinstance(found, Augmenter)
     return found
@@ -398,7 +399,7 @@ def test_no_pseudo_view_comes_from_a_held_out_view(tmp_path: Path) -> None:
     held_out = {view.name for view in run.scene.test}
     run.sampler.order = [0]
     backward(run)
-    for augmenter in run.augmenters:
+    for augmenter in run.augmenters.values():
         assert isinstance(augmenter, PseudoDetails)
         views = [view for views in augmenter.views.values() for view in views]
         assert views
@@ -507,7 +508,7 @@ SPOILT = {
 
 def with_regenerator(run: Run, regenerator: Any) -> PseudoDetails:
     old = augmenter_of(run)
-    return PseudoDetails(old.options, replace(old.context, regenerator=of_role(regenerator, old.options.checks)))
+    return PseudoDetails(old.options, replace(old.context, regenerator=of_role(regenerator)))
 
 
 @pytest.mark.parametrize("reason", SPOILT)
@@ -543,7 +544,7 @@ def test_results_can_be_averaged(tmp_path: Path) -> None:
     for samples in (1, 16):
         old = augmenter_of(run)
         options = replace(old.options, samples=samples, seeds="per_view")
-        noisy = PseudoDetails(options, replace(old.context, regenerator=of_role(Noisy(10**9, None), options.checks)))
+        noisy = PseudoDetails(options, replace(old.context, regenerator=of_role(Noisy(10**9, None))))
         noisy.term(run, 45, 0)
         pairs = [(a.target.float(), b.target.float()) for a, b in zip(plain.views[0], noisy.views[0], strict=True)]
         errors.append(float(torch.stack([(a - b).square().mean() for a, b in pairs]).mean()))

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import pytest
 
-from gsx.augmenters.checked_regenerator import Checks
+from gsx.augmenters.checks import Checks
 from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
 from gsx.core.options import flattened

@@ -19,7 +19,7 @@ from small_scene import small_scene, spread
 from tiny import OVERRIDES, tiny_run
 from torch import Tensor
 
-from gsx.augmenters.checked_regenerator import displacement
+from gsx.augmenters.checks import displacement
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.data.camera import Camera

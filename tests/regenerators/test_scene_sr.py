@@ -8,7 +8,7 @@ import torch
 from regenerating import EDGE, Photo, camera, request, strict_checks, stripes
 from torch import Tensor
 
-from gsx.augmenters.checked_regenerator import strayed, unusable
+from gsx.augmenters.checks import defect, violations
 from gsx.core.data.reduction import Reduction, box_average, projected
 from gsx.core.data.resize import resize, to_uint8
 from gsx.core.data.scene import View
@@ -86,8 +86,8 @@ def test_what_it_makes_reduces_to_what_it_was_given(learnt: SceneSR) -> None:
         (result,) = learnt.regenerate([given])
         assert result.shape == (3, 12 * scale, 12 * scale)
         assert float((box_average(result, scale) - low).abs().max()) < 2 / 255
-        assert unusable(given, result) == ""
-        assert strayed(given, result, strict_checks()) == {}
+        assert defect(given, result) == ""
+        assert violations(given, result, strict_checks()) == {}
 
 
 def test_it_learns_and_enlarges_by_the_scenes_own_reduction(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from gsx.augmenters.regenerator_context import regenerator_context
+from gsx.augmenters.checked_regenerator import CheckedRegenerator, Redrawing
 from gsx.core.data.resize import to_uint8
 from gsx.core.ranges import Share, Weight
 from gsx.core.training.augmenter import AugmenterContext
@@ -20,10 +20,10 @@ class SteadyOptions:
     weight: Weight
 
 
-class SteadyZoom:
+class SteadyZoom(Redrawing):
     def __init__(self, options: SteadyOptions, context: AugmenterContext) -> None:
         self.options, self.context = options, context
-        self.regenerator = context.regenerator("upscale")
+        self.regenerator = CheckedRegenerator.of_role(context, "upscale")
         self.regenerator.refuse(context.scene.train, [2], moved=False)
         self.views: dict[int, list[PseudoView]] = {}
 
@@ -37,7 +37,7 @@ class SteadyZoom:
         if step <= self.begins():
             return None
         if not self.views:
-            self.regenerator.prepare(regenerator_context(run, self.context.seed))
+            self.regenerator.prepare(run, self.context)
         if view not in self.views:
             self.views[view] = self.zoomed(view)
         parts = [(pseudo, self.options.weight) for pseudo in self.views[view]]

@@ -1,81 +1,35 @@
-"""Regenerators as augmenters get them: whatever they make is put right, checked, counted and told."""
+"""Regenerators as augmenters use them: results are corrected, checked and counted."""
 
 import logging
-import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from gsx.augmenters.checks import Checks, defect, match_colour, violations
 from gsx.core.data.reduction import projected
 from gsx.core.data.scene import View
 from gsx.core.errors import TrainingError
-from gsx.core.quality.metrics import psnr
-from gsx.core.ranges import Range
 from gsx.core.shapes import Float
+from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.regenerator import Refusing, Regenerator, RegeneratorContext, Request
+from gsx.core.training.render import render
+from gsx.core.training.run import Run
 
 logger = logging.getLogger(__name__)
 
 MOST_DROPPED = 0.5
 """Losing more than this share of the pictures at one scale is an error."""
 FEWEST = 8
-"""Of pictures that are asked for now and then, at least so many are awaited before that is said."""
-LARGEST_DRIFT = 2 / 255
-"""Mean colours that differ by more are put right."""
-MOST_CORRECTIONS = 4
-"""Of a mean colour."""
-LEAST_SLOPE = 1e-3
-"""Pictures with gentler slopes than this in some direction, display values per px, show no displacement in it."""
-ACTIONS = ("drop", "warn", "off")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Check:
-    """A limit, and what happens to a picture beyond it."""
-
-    limit: Annotated[float, Range(0, 1e6)]
-    action: str
-    """drop; warn: it is kept, counted and told; off: nothing is looked at."""
-
-    def __post_init__(self) -> None:
-        if self.action not in ACTIONS:
-            raise ValueError(f"the action of a check is '{self.action}'; choose drop, warn or off (in YAML 'off')")
-
-    @property
-    def active(self) -> bool:
-        """Whether anything happens beyond the limit."""
-        return self.action != "off"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Checks:
-    """What a redrawn picture has to keep of what it was made from; values in conf/checks."""
-
-    colour: Check
-    """Largest change of the mean colour, 8-bit levels, after `colour_matched`."""
-    agreement: Check
-    """Least PSNR between an enlarged picture, reduced again, and its input, dB."""
-    displacement: Check
-    """Largest displacement, px of the input."""
-
-
-@runtime_checkable
-class WithChecks(Protocol):
-    """Options of an augmenter that has checks of its own; the others get those of the regenerator's role."""
-
-    @property
-    def checks(self) -> Checks:
-        """What a redrawn picture has to keep."""
-        ...
+"""Pictures that are awaited before that is an error, where they are requested a few at a time."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Redrawn:
-    """What has become of a request."""
+    """What became of a request."""
 
     scale: int
     image: Float[Tensor, "3 H W"] | None
@@ -83,69 +37,69 @@ class Redrawn:
     problem: str = ""
     """Why it is dropped."""
     warnings: dict[str, str] = field(default_factory=dict)
-    """By check, what is told of a picture that is kept."""
+    """Violations of a picture that is kept, by check."""
 
 
 @dataclass(eq=False, kw_only=True)
 class Tally:
-    """What has become of the pictures that an augmenter asked for."""
+    """Counts of the pictures that an augmenter requested and lost."""
 
     name: str
     """Of the augmenter."""
     remedies: list[str] = field(default_factory=list)
     """What helps where too many are lost."""
     pending: list[Redrawn] = field(default_factory=list)
-    """Those that no account has been given of; without their pictures."""
+    """Requests that are in no account yet; without their pictures."""
     latest: dict[str, Any] = field(default_factory=dict)
     """The last account."""
     asked: Counter[str] = field(default_factory=Counter)
-    """All so far, by scale."""
+    """All requests so far, by scale."""
     dropped: Counter[str] = field(default_factory=Counter)
-    """Of these."""
+    """Those of them that were dropped."""
 
-    def recall(self, lines: Sequence[Mapping[str, Any]]) -> None:
-        """Count what a run asked for before it was interrupted, from lines of metrics.jsonl."""
-        for account in (line.get("pseudo", {}).get(self.name) for line in lines):
-            if account:
-                self.asked.update(account["asked"])
-                self.dropped.update(account["dropped"])
+    def recall(self, accounts: Sequence[Mapping[str, Any]]) -> None:
+        """Counts what a run requested before it was interrupted."""
+        for account in accounts:
+            self.asked.update(account["asked"])
+            self.dropped.update(account["dropped"])
 
     def account(self, event: int, whole: bool = True) -> dict[str, Any]:
-        """Pictures asked for, dropped, and by check warned of, by scale; said in the log where there are any.
+        """Counts pending requests, dropped ones and warnings by scale, and logs the losses.
 
-        `whole`: they are all of an event; otherwise losses are judged over the run.
+        Args:
+            whole: they are all of an event; otherwise losses are compared with those of the run.
 
         Raises:
             TrainingError: more than half of the pictures of a scale could not be used.
         """
-        drawn, self.pending = self.pending, []
-        asked, dropped = by_scale(drawn), by_scale([one for one in drawn if one.problem])
+        redrawn, self.pending = self.pending, []
+        asked, dropped = by_scale(redrawn), by_scale([one for one in redrawn if one.problem])
         self.asked.update(asked)
         self.dropped.update(dropped)
         for scale, count in dropped.items():
-            reason = next(one.problem for one in drawn if one.problem and str(one.scale) == scale)
+            reason = next(one.problem for one in redrawn if one.problem and str(one.scale) == scale)
             logger.warning("%s: %d of %d x%s pictures dropped: %s", self.name, count, asked[scale], scale, reason)
-            lost, of = (count, asked[scale]) if whole else (self.dropped[scale], self.asked[scale])
-            if lost > MOST_DROPPED * of and (whole or of >= FEWEST):
+            lost, total = (count, asked[scale]) if whole else (self.dropped[scale], self.asked[scale])
+            if lost > MOST_DROPPED * total and (whole or total >= FEWEST):
                 raise TrainingError(
-                    f"augmenter {self.name} lost {lost} of {of} pictures at x{scale}, step {event}: {reason}; "
+                    f"augmenter {self.name} lost {lost} of {total} pictures at x{scale}, step {event}: {reason}; "
                     f"{', or '.join(self.remedies)}"
                 )
-        self.latest = {"event": event, "asked": asked, "dropped": dropped, "warned": self.warned(drawn)}
+        self.latest = {"event": event, "asked": asked, "dropped": dropped, "warned": self.warned(redrawn)}
         return self.latest
 
-    def warned(self, drawn: Sequence[Redrawn]) -> dict[str, dict[str, int]]:
-        """Pictures that are kept although a check warns of them, by check and scale."""
+    def warned(self, redrawn: Sequence[Redrawn]) -> dict[str, dict[str, int]]:
+        """Counts pictures that are kept although a check warns of them, by check and scale."""
         counts: dict[str, dict[str, int]] = {}
-        for check in dict.fromkeys(check for one in drawn for check in one.warnings):
-            strays = [one for one in drawn if check in one.warnings]
+        for check in dict.fromkeys(check for one in redrawn for check in one.warnings):
+            strays = [one for one in redrawn if check in one.warnings]
             counts[check] = by_scale(strays)
             first = strays[0].warnings[check]
-            logger.warning("%s: %d of %d pictures kept although %s", self.name, len(strays), len(drawn), first)
+            logger.warning("%s: %d of %d pictures kept although %s", self.name, len(strays), len(redrawn), first)
         return counts
 
     def account_at(self, step: int) -> dict[str, Any]:
-        """The account of the pictures asked for at this step; empty where there were none.
+        """Returns the account of the pictures requested at a step; empty where there were none.
 
         Raises:
             TrainingError: more than half of the pictures of a scale could not be used, over the run.
@@ -155,32 +109,9 @@ class Tally:
         return self.latest if self.latest.get("event") == step - 1 else {}
 
 
-def added_accounts(accounts: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
-    """The accounts of several processes as those of one, by augmenter."""
-    out = {}
-    for name in dict.fromkeys(name for by_name in accounts for name in by_name):
-        own = [by_name[name] for by_name in accounts if name in by_name]
-        checks = dict.fromkeys(check for account in own for check in account["warned"])
-        out[name] = {
-            "event": own[0]["event"],
-            "asked": added([account["asked"] for account in own]),
-            "dropped": added([account["dropped"] for account in own]),
-            "warned": {check: added([account["warned"].get(check, {}) for account in own]) for check in checks},
-        }
-    return out
-
-
-def added(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Sums by scale."""
-    total: Counter[str] = Counter()
-    for count in counts:
-        total.update(count)
-    return dict(sorted(total.items(), key=lambda item: float(item[0])))
-
-
-def by_scale(drawn: Sequence[Redrawn]) -> dict[str, int]:
-    """How many there are at each scale; keys as JSON has them."""
-    counts = Counter(one.scale for one in drawn)
+def by_scale(redrawn: Sequence[Redrawn]) -> dict[str, int]:
+    """Counts requests at each scale; keys as JSON has them."""
+    counts = Counter(one.scale for one in redrawn)
     return {str(scale): counts[scale] for scale in sorted(counts)}
 
 
@@ -192,129 +123,93 @@ class CheckedRegenerator:
     checks: Checks
     tally: Tally
 
+    @classmethod
+    def of_role(cls, context: AugmenterContext, role: str, checks: Checks | None = None) -> "CheckedRegenerator":
+        """Wraps the regenerator of a role; checks: the augmenter's, None: those of the role."""
+        limits = f"checks.{role}" if checks is None else f"augmenter.{context.name}.checks"
+        tally = Tally(name=context.name, remedies=[f"choose another regenerator/{role}", f"loosen {limits}"])
+        return cls(inner=context.regenerator(role), checks=checks or context.checks[role], tally=tally)
+
     def refuse(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
-        """Before training: raise ConfigError or InputError if it can say already that it will not do (`Refusing`)."""
+        """Raises ConfigError or InputError before training if the regenerator cannot redraw these (`Refusing`)."""
         if isinstance(self.inner, Refusing):
             self.inner.check(views, scales, moved)
 
-    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
-        """Learn from the scene, if there is anything to learn; figures for the log. To be called at every event."""
-        return self.inner.prepare(context)
+    def prepare(self, run: Run, context: AugmenterContext) -> dict[str, float]:
+        """Lets the regenerator learn from training views and the model at every event; returns figures for the log."""
+        return self.inner.prepare(
+            RegeneratorContext(
+                views=run.train_views,
+                reduction=run.scene.reduction,
+                render=lambda camera: render(run, camera).image,
+                held_out=lambda share: context.held_out(run, share, context.seed),
+                step=run.step,
+                seed=context.seed,
+                device=run.device,
+                folder=run.folder / "regenerators",
+                refuse_if_stopping=run.refuse_if_stopping,
+            )
+        )
 
     def redraw(self, requests: Sequence[Request], *, samples: int = 1, project: bool = False) -> list[Redrawn]:
-        """What becomes of each request, in order.
+        """Redraws, corrects and checks pictures, in order.
 
-        `samples`: of each the mean of so many results counts. `project`: enlarged pictures are moved to the nearest
-        one that reduces to the request's.
+        Args:
+            samples: results whose mean counts.
+            project: whether enlarged pictures are moved to the nearest one that reduces to the request's.
         """
-        results = [self.results([own_copy(one, n) for one in requests]) for n in range(samples)]
-        drawn = []
-        for request, *of_one in zip(requests, *results, strict=True):
-            drawn.append(self.checked(request, of_one, project))
-        self.tally.pending += [replace(one, image=None) for one in drawn]
-        return drawn
+        results = [self.regenerate([copy_for_sample(one, n) for one in requests]) for n in range(samples)]
+        redrawn = [self.checked(request, of_one, project) for request, *of_one in zip(requests, *results, strict=True)]
+        self.tally.pending += [replace(one, image=None) for one in redrawn]
+        return redrawn
 
-    def results(self, requests: Sequence[Request]) -> list[Tensor]:
-        """What the regenerator makes of requests.
+    def regenerate(self, requests: Sequence[Request]) -> list[Tensor]:
+        """Calls the regenerator.
 
         Raises:
-            TrainingError: it is not a picture for each.
+            TrainingError: it does not return a picture for each request.
         """
-        found: Any = self.inner.regenerate(requests)
-        told = f"{type(self.inner).__name__}.regenerate was asked for {len(requests)} pictures and returned"
+        returned: Any = self.inner.regenerate(requests)
+        message = f"{type(self.inner).__name__}.regenerate was asked for {len(requests)} pictures and returned"
         remedy = "it is to return a tensor [3, h, w] for each, in order"
-        if not isinstance(found, Iterable):
-            raise TrainingError(f"{told} {type(found).__name__}: {remedy}")
-        pictures = list(found)
+        if not isinstance(returned, Iterable):
+            raise TrainingError(f"{message} {type(returned).__name__}: {remedy}")
+        pictures = list(returned)
         if other := [type(one).__name__ for one in pictures if not isinstance(one, Tensor)]:
-            raise TrainingError(f"{told} {other[0]} among them: {remedy}")
+            raise TrainingError(f"{message} {other[0]} among them: {remedy}")
         if len(pictures) != len(requests):
-            raise TrainingError(f"{told} {len(pictures)}: {remedy}")
+            raise TrainingError(f"{message} {len(pictures)}: {remedy}")
         return pictures
 
     def checked(self, request: Request, results: Sequence[Tensor], project: bool) -> Redrawn:
-        """The mean of the results, put right, if it may be used."""
-        name, problems = request.view.name, [told for one in results if (told := unusable(request, one))]
-        if problems:
-            return Redrawn(scale=request.scale, image=None, problem=f"{name}: {problems[0]}")
+        """Takes the mean of the results, corrects its colour, and drops it if a check says so."""
+        name, scale = request.view.name, request.scale
+        if defects := [text for one in results if (text := defect(request, one))]:
+            return Redrawn(scale=scale, image=None, problem=f"{name}: {defects[0]}")
         result = torch.stack([one.detach().cpu().float() for one in results]).mean(0)
-        result = colour_matched(request, result)
-        if project and request.scale > 1:
-            result = projected(result, request.image.cpu(), request.scale, request.reduction)
-        found = strayed(request, result, self.checks)
-        dropped = [told for check, told in found.items() if getattr(self.checks, check).action == "drop"]
-        if dropped:
-            return Redrawn(scale=request.scale, image=None, problem=f"{name}: {'; '.join(dropped)}")
-        return Redrawn(
-            scale=request.scale, image=result, warnings={check: f"{name}: {told}" for check, told in found.items()}
-        )
+        result = match_colour(request, result)
+        if project and scale > 1:
+            result = projected(result, request.image.cpu(), scale, request.reduction)
+        beyond = violations(request, result, self.checks)
+        if dropped := [text for check, text in beyond.items() if getattr(self.checks, check).action == "drop"]:
+            return Redrawn(scale=scale, image=None, problem=f"{name}: {'; '.join(dropped)}")
+        return Redrawn(scale=scale, image=result, warnings={check: f"{name}: {text}" for check, text in beyond.items()})
 
 
-def own_copy(request: Request, sample: int) -> Request:
-    """A request by the seed of a sample, with a picture that a regenerator may write into."""
+def copy_for_sample(request: Request, sample: int) -> Request:
+    """Copies a request with the seed of a sample; a regenerator may write into its picture."""
     return replace(request, seed=request.seed + sample, image=request.image.clone())
 
 
-def colour_matched(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """The result, its mean colour put right where it is more than LARGEST_DRIFT off at the resolution of its input:
-    where light is reduced a finer picture has another mean, and one correction is not enough."""
-    for _ in range(MOST_CORRECTIONS):
-        low, given = both_reduced(request, result)
-        drift = low.mean((1, 2)) - given.mean((1, 2))
-        if float(drift.abs().max()) <= LARGEST_DRIFT:
-            break
-        result = result - drift[:, None, None]
-    return result
+class Redrawing:
+    """Base of augmenters whose pictures come from a checked regenerator: accounts for them (`Accounting`)."""
 
+    regenerator: CheckedRegenerator
 
-def both_reduced(
-    request: Request, result: Float[Tensor, "3 H W"]
-) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 h w"]]:
-    """(a result as coarse as its input, the input), without the rim of the window, which was reduced from pixels beyond
-    it."""
-    reduction = request.reduction
-    return reduction.inner(reduction.reduce(result, request.scale)), reduction.inner(request.image.cpu())
+    def account(self, step: int) -> dict[str, Any]:
+        """Reports the pictures requested at a step."""
+        return self.regenerator.tally.account_at(step)
 
-
-def unusable(request: Request, result: Tensor) -> str:
-    """Why a result is no picture of what was asked for; empty for one that is."""
-    expected = (3, *request.result_size)
-    if tuple(result.shape) != expected:
-        return f"it is {tuple(result.shape)} and should be {expected}"
-    if not result.is_floating_point():
-        return f"its values are {str(result.dtype).removeprefix('torch.')} and should be display values in [0, 1]"
-    if not bool(torch.isfinite(result).all()):
-        return "it holds values that are not finite"
-    return ""
-
-
-def strayed(request: Request, result: Float[Tensor, "3 H W"], checks: Checks) -> dict[str, str]:
-    """How a result differs from its input by more than a check allows, in words by the check's name."""
-    low, given = both_reduced(request, result.cpu().float().clamp(0, 1))
-    drift = 255 * float((low.mean((1, 2)) - given.mean((1, 2))).abs().max())
-    agreement = psnr(low, given) if request.scale > 1 else math.inf
-    shift = displacement(low, given) if checks.displacement.active else 0.0
-    words = {
-        "colour": (drift > checks.colour.limit, f"its mean colour is {drift:.1f} levels off"),
-        "agreement": (agreement < checks.agreement.limit, f"reduced it is {agreement:.1f} dB from its input"),
-        "displacement": (shift > checks.displacement.limit, f"it is displaced by {shift:.2f} px"),
-    }
-    return {name: told for name, (beyond, told) in words.items() if beyond and getattr(checks, name).active}
-
-
-def displacement(image: Float[Tensor, "3 h w"], reference: Float[Tensor, "3 h w"]) -> float:
-    """Length of the shift that explains their difference best to first order, px; 0 where nothing could show one.
-
-    The least-squares solution of image - reference = shift . gradient (Lucas and Kanade 1981).
-    """
-    if min(reference.shape[1:]) < 3:
-        return 0.0
-    grey, other = reference.double().mean(0), image.double().mean(0)
-    dx = (grey[1:-1, 2:] - grey[1:-1, :-2]) / 2
-    dy = (grey[2:, 1:-1] - grey[:-2, 1:-1]) / 2
-    difference = (other - grey)[1:-1, 1:-1]
-    slopes = torch.stack([dx.flatten(), dy.flatten()])
-    system, right = slopes @ slopes.T, slopes @ difference.flatten()
-    if float(torch.linalg.eigvalsh(system)[0]) < LEAST_SLOPE**2 * slopes.shape[1]:
-        return 0.0
-    return float(torch.linalg.solve(system, right).norm())
+    def recall(self, accounts: Sequence[Mapping[str, Any]]) -> None:
+        """Counts what the run requested before it was interrupted."""
+        self.regenerator.tally.recall(accounts)

@@ -6,13 +6,14 @@ regenerator redraw what is cut from the photograph or rendered there; compare wi
 
 import logging
 from collections.abc import Sequence, Set
+from dataclasses import replace
 from typing import Any
 
 from gsx.augmenters.cameras import window_size
+from gsx.augmenters.checked_regenerator import CheckedRegenerator, Redrawing
 from gsx.augmenters.planner import Planner
 from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.augmenters.redraw import Redrawer
-from gsx.augmenters.regenerator_context import regenerator_context
 from gsx.augmenters.store import Store
 from gsx.augmenters.timing import event_at, events_of, progress, span_of, stepped
 from gsx.core.errors import ConfigError
@@ -28,7 +29,7 @@ LEAST_WINDOW = 4
 """Narrowest window that shows anything, px."""
 
 
-class PseudoDetails:
+class PseudoDetails(Redrawing):
     """Pseudo views of one kind and their share in the loss."""
 
     def __init__(self, options: PseudoOptions, context: AugmenterContext) -> None:
@@ -39,7 +40,7 @@ class PseudoDetails:
             views=len(context.scene.train),
         )
         self.events, self.span = events_of(options.timing, self.schedule), span_of(options.timing, self.schedule)
-        self.regenerator = context.regenerator(options.role)
+        self.regenerator = CheckedRegenerator.of_role(context, options.role, options.checks)
         if max(options.scales) > 1 and options.project == "none":
             self.regenerator.tally.remedies.append(f"augmenter.{context.name}.project=exact")
         self.refuse_impossible()
@@ -94,37 +95,37 @@ class PseudoDetails:
         event = event_at(step, self.events, self.span)
         if event is None:
             self.views, self.event = {}, 0
-            run.views.closer.pop(self.context.name, None)
             return None
+        made: list[PseudoView] = []
         if event != self.event:
-            made = self.of_event(run, event, view)
-            self.views, self.event = by_parent(made), event
-            run.views.closer[self.context.name] = made
+            views, fresh = self.of_event(run, event, view)
+            self.views, self.event = by_parent(views), event
+            made = views if fresh else []
         split = self.options.weight_split
         inside, place = (progress(step, event, self.events, self.span, kind) for kind in ("window", split))
-        return self.weighted(run, self.views.get(view, []), place, inside)
+        if view not in self.views and not made:
+            return None
+        return replace(self.weighted(run, view, place, inside), made=made)
 
-    def weighted(self, run: Run, views: Sequence[PseudoView], place: float, inside: float) -> Term | None:
-        """The term of these views, so far along the weights and inside the window; None for none.
+    def weighted(self, run: Run, view: int, place: float, inside: float) -> Term:
+        """Weights the pseudo views of a training view, at a place along the weights and inside the window, 0 to 1.
 
         A view weighs the same whether others of its training view were dropped or not; what these would have taken of
         the backbone's own loss stays there.
         """
-        options = self.options
-        if not views:
-            return None
+        options, views = self.options, self.views.get(view, [])
         share = stepped(options.weights, place, options.weight_split)
         direct = options.mode == "direct" or (options.mode == "auto" and not shared_colour(run.backbone.table))
         each = options.gain * (options.direct_weight if direct else share)
         scales, pictures = self.planned()
         count = pictures if options.reduce == "all" else scales
         frozen = options.freeze_shared == "active" or (options.freeze_shared == "half" and inside < 0.5)
-        width, height = run.scene.train[views[0].parent].camera.size
-        areas = [view.camera.width * view.camera.height / (width * height) for view in views]
+        width, height = run.scene.train[view].camera.size
+        areas = [pseudo.camera.width * pseudo.camera.height / (width * height) for pseudo in views]
         sizes = areas if options.per_pixel else [1.0] * len(views)
         return Term(
             name=self.context.name,
-            parts=[(view, each / count * size) for view, size in zip(views, sizes, strict=True)],
+            parts=[(pseudo, each / count * size) for pseudo, size in zip(views, sizes, strict=True)],
             replaces=0.0 if direct else share * len(views) / pictures,
             observed=options.densify,
             shared=not frozen,
@@ -137,8 +138,10 @@ class PseudoDetails:
         coarser = len(options.coarser)
         return scales + coarser, scales * (options.variants + options.base) + coarser
 
-    def of_event(self, run: Run, event: int, view: int) -> list[PseudoView]:
-        """The pseudo views of an event: made now, or as the run made them before it was interrupted.
+    def of_event(self, run: Run, event: int, view: int) -> tuple[list[PseudoView], bool]:
+        """Returns (the pseudo views of an event, whether they were made for this step).
+
+        They are made now, or read as the run made them before it was interrupted.
 
         Only those that steps of its window will ask for, the first of them for `view` and the rest of its batch: the
         others are never looked at. Of several processes the first makes them all.
@@ -151,7 +154,7 @@ class PseudoDetails:
         made = self.written(run, event, view) if fresh and run.ranks.first else None
         if fresh:
             run.ranks.all_gather(None)  # the others wait for the file
-        return self.store.recalled(run, event) if made is None else made
+        return (self.store.recalled(run, event) if made is None else made), fresh
 
     def written(self, run: Run, event: int, view: int) -> list[PseudoView]:
         """The pseudo views of an event that begins with this step, made and written to its file."""
@@ -166,7 +169,7 @@ class PseudoDetails:
         Raises:
             TrainingError: more than half of the pictures of a scale could not be used.
         """
-        learnt = self.regenerator.prepare(regenerator_context(run, self.context.seed))
+        learnt = self.regenerator.prepare(run, self.context)
         if learnt:
             told = ", ".join(f"{name} {value:.3g}" for name, value in learnt.items())
             logger.info("%s, regenerator at step %d: %s", self.context.name, event, told)

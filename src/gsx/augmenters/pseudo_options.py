@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from gsx.augmenters.cameras import KEPT, NOISES, WINDOWS
-from gsx.augmenters.checked_regenerator import Checks
+from gsx.augmenters.checks import Checks
 from gsx.augmenters.pixel_weights import WeightMap, sampled_better, splatsure
 from gsx.augmenters.timing import SPLITS, Timing, events_of
 from gsx.core.ranges import Range, Seed, Share, Steps, Weight

@@ -15,6 +15,7 @@ from gsx.augmenters.consistency import consistent_pixels, exactly_consistent
 from gsx.augmenters.pixel_weights import agreeing, in_bytes
 from gsx.augmenters.planner import PseudoViewSpec, reduced
 from gsx.augmenters.pseudo_options import WEIGHT_MAPS, PseudoOptions
+from gsx.augmenters.store import picture_name
 from gsx.augmenters.timing import ramp
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
@@ -24,7 +25,7 @@ from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.shapes import Float, UInt8
-from gsx.core.training.pseudo_views import PseudoView, picture_name
+from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.regenerator import Request
 from gsx.core.training.render import render, splats_for
 from gsx.core.training.run import Run

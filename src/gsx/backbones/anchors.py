@@ -6,7 +6,7 @@ filters: each is a part that knows nothing of the others (docs/backbones.md).
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +37,7 @@ from gsx.core.rasterizer import Rendering, goes_compiled, touches
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import BackboneContext, Observation
 from gsx.core.training.parameter_table import Networks, ParameterTable, take_adam_step
+from gsx.core.training.pseudo_views import PseudoView
 
 
 def neural_anchors(options: NeuralOptions, context: BackboneContext) -> "Anchors":
@@ -174,6 +175,10 @@ class Anchors:
         """Add an observation to the statistics."""
         if seen:
             observe(self.table, **seen)
+
+    def pseudo_views_made(self, views: Sequence[PseudoView], step: int) -> None:
+        """Tells the filter."""
+        self.filter.pseudo_views_made(views)
 
     def densify_and_prune(self, step: int) -> Mapping[str, float]:
         """Grow and prune when due (Scaffold-GS, train.py)."""

@@ -1,7 +1,7 @@
 """3D Gaussian Splatting (Kerbl et al. 2023): explicit Gaussians with adaptive density control (3D-GS)."""
 
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -34,6 +34,7 @@ from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import BackboneContext, DrawnSplats, Observation
 from gsx.core.training.importance import Probe, random_views
 from gsx.core.training.parameter_table import ParameterTable, take_adam_step
+from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.schedule import log_linear
 from gsx.formats.splat_files import columns_of
 
@@ -188,6 +189,10 @@ class GS3D:
     def validation_window(self, view: View, step: int) -> Window | None:
         """What capacity is judged by."""
         return self.capacity.validation_window(self.table, view, step)
+
+    def pseudo_views_made(self, views: Sequence[PseudoView], step: int) -> None:
+        """Tells the filter."""
+        self.filter.pseudo_views_made(views)
 
     def densify_and_prune(self, step: int) -> dict[str, float]:
         """Clear once, clone, split, prune and reset when due."""

@@ -5,7 +5,7 @@ The 3D filter widens each Gaussian by what the finest training camera can resolv
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Protocol, runtime_checkable
 
 import torch
@@ -85,6 +85,10 @@ class Filter(Protocol):
         """Whether to do so at a step without a density event."""
         ...
 
+    def pseudo_views_made(self, views: Sequence[PseudoView]) -> None:
+        """Take notice of the pseudo views that were made for the step under way."""
+        ...
+
     def narrows(self, step: int) -> bool:
         """Whether sizes after a step are smaller for what is seen more finely: the picture is to go on as it was."""
         ...
@@ -115,6 +119,9 @@ class NoFilter:
     def due(self, step: int) -> bool:
         """Never."""
         return False
+
+    def pseudo_views_made(self, views: Sequence[PseudoView]) -> None:
+        """They change nothing."""
 
     def narrows(self, step: int) -> bool:
         """Never."""
@@ -159,6 +166,8 @@ class MipFilter:
     schedule: Schedule
     settled: int
     """Step at which density control ends: from there on the filter has a clock of its own."""
+    made: list[PseudoView] = field(default_factory=list)
+    """Pseudo views that were made for the step under way, if they count."""
     note: str = "3D filter fused into scales and opacities"
 
     def rules(self, raster: RasterSettings) -> RasterSettings:
@@ -174,7 +183,7 @@ class MipFilter:
         if options.views > 1:
             sizes = sizes / several_views(points, cameras, sizes, options)
         if options.pseudo:
-            earn(table, points, resolution.closer_after(step), sizes, options)
+            earn(table, points, self.made, sizes, options)
             sizes = sizes.minimum(table["earned"])
         table.columns["filter"] = sizes
 
@@ -189,8 +198,11 @@ class MipFilter:
 
     def narrows(self, step: int) -> bool:
         """Where renders become finer, and where pseudo views that count for it were made."""
-        resolution = self.context.views
-        return resolution.changes_after(step) or (self.options.pseudo and bool(resolution.closer_after(step)))
+        return self.context.views.changes_after(step) or bool(self.made)
+
+    def pseudo_views_made(self, views: Sequence[PseudoView]) -> None:
+        """Keep those of this step, if they are to narrow the filter."""
+        self.made[:] = views if self.options.pseudo else []
 
     def smoothed(
         self,

@@ -24,9 +24,9 @@ from gsx.core.errors import ConfigError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.training.finer_raster import finer_raster, times_as_fine
+from gsx.core.training.forward import render_for_training
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.core.training.trainer import rendered
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
@@ -60,7 +60,7 @@ def fresh(folder: Path, *more: str) -> Run:
 def test_what_is_compared_and_looked_at_is_the_reduced_picture(tmp_path: Path) -> None:
     run = fresh(tmp_path, "training.supersample=2")
     camera = run.scene.train[0].camera
-    drawn, rendering = rendered(run, camera, 1, run.background)
+    drawn, rendering = render_for_training(run, camera, 1, run.background)
     fine = rasterize(drawn.splats, camera.zoom(2), run.raster, background=run.background).image
     assert rendering.screen.size == (96, 72)
     assert rendering.image.shape == (3, 36, 48)
@@ -193,7 +193,7 @@ def test_it_is_evaluated_as_it_was_trained_unless_told(tmp_path: Path) -> None:
     view = whole.scene.test[0]
     for asked, times in ((0, 2), (1, 1), (4, 4)):
         run, settings = open_run(tmp_path / "whole", plugins(), [f"eval.supersample={asked}"])
-        picture = Evaluator(run, settings.evaluation).rendered(view).image
+        picture = Evaluator(run, settings.evaluation).render_for_training(view).image
         drawn = run.backbone.draw(view.camera, run.model_step).splats
         fine = rasterize(drawn, view.camera.zoom(times), run.raster, background=run.background).image.detach()
         assert (picture - avg_pool2d(fine, times).clamp(0, 1)).abs().max() <= 1e-5

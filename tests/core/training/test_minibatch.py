@@ -145,7 +145,7 @@ def test_what_a_term_makes_shared_parameters_forget_is_its_own_only(tmp_path: Pa
     value = 0.5 * pseudo_loss(image, pseudo)
     value.backward()
     added = cleared_gradients(run)
-    run.augmenters = [augmenter]
+    run.augmenters = {"still": augmenter}
     step = backward(run)
     found = cleared_gradients(run)
     assert colour
@@ -196,7 +196,8 @@ class Judge:
             run.backbone.table, {name: value.clone() for name, value in self.start.items()}
         )
         run.training = replace(run.training, batch=batch, ssim_weight=ssim_weight)
-        run.sampler.order, run.sampler.batch, run.augmenters = [0, 5, 1, 4], batch, augmenters
+        run.sampler.order, run.sampler.batch = [0, 5, 1, 4], batch
+        run.augmenters = dict(enumerate(augmenters))
         for _ in range(steps):
             for seen in backward(run).seen:
                 run.backbone.accumulate(seen)
@@ -314,7 +315,7 @@ def test_pseudo_views_are_made_for_all_views_of_a_window(tmp_path: Path) -> None
     run = fresh(tmp_path / "run", *words)
     run.step, run.sampler.order = 44, [0, 5, 1, 4, 2]
     step = backward(run)
-    augmenter = run.augmenters[0]
+    augmenter = run.augmenters["upscale"]
     assert isinstance(augmenter, PseudoDetails)
     assert sorted(augmenter.views) == [1, 2, 4, 5]
     assert step.terms["upscale"] > 0
@@ -338,7 +339,7 @@ class Failing(Still):
 
 def test_a_step_that_fails_has_not_been_taken(tmp_path: Path) -> None:
     run = fresh(tmp_path / "run", "training.batch=2", "training.random_background=true")
-    run.augmenters, state = [Failing((1,))], run.generator.get_state()
+    run.augmenters, state = {"still": Failing((1,))}, run.generator.get_state()
     with pytest.raises(TrainingError, match="lost its pictures"):
         train_step(run, plugins())
     assert run.sampler.order == [0, 5, 1, 4]

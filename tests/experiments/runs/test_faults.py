@@ -167,7 +167,7 @@ def test_a_run_that_is_asked_to_stop_leaves_an_event_at_once(tmp_path: Path, mon
     with monkeypatch.context() as patch:
         patch.setattr(Redrawer, "request", stopping)
         run = tiny_run(tmp_path / "run", EVENT)
-    assert run.step == run.augmenters[0].events[0] < 8
+    assert run.step == run.augmenters["upscale"].events[0] < 8
     assert len(asked) == 2, "the third picture is not asked for"
     assert json.loads((run.folder / "status.json").read_text())["state"] == "interrupted"
     assert not list((run.folder / "pseudo").glob("*.safetensors"))

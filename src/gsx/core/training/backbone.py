@@ -16,6 +16,7 @@ from gsx.core.rasterizer import RasterSettings, Rendering, drawable
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.parameter_table import ParameterTable, keep_rows
+from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.schedule import Schedule
 from gsx.core.training.training_views import TrainingViews
 
@@ -195,6 +196,15 @@ def behind_scene(backbone: Backbone[Any], means: Float[Tensor, "M 3"]) -> Bool[T
     if isinstance(backbone, Backdrop):
         return backbone.behind_scene(means)
     return torch.zeros_like(means[:, 0], dtype=torch.bool)
+
+
+@runtime_checkable
+class PseudoViewListener(Protocol):
+    """A backbone that takes notice of new pseudo views."""
+
+    def pseudo_views_made(self, views: Sequence[PseudoView], step: int) -> None:
+        """Takes the pseudo views that were made for a step, mostly none, before density control and update."""
+        ...
 
 
 @runtime_checkable

@@ -4,14 +4,14 @@ Every view's own loss is sent back, and the sums are divided in the end. An obse
 mean loss (`backbones.density`), so that published thresholds hold for any number of views.
 """
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 
-from gsx.augmenters.checked_regenerator import added_accounts
 from gsx.core.training.parameter_table import ParameterTable, gradients, named_parameters, zero_grad
 from gsx.core.training.run import Run, StepResult
 
@@ -50,7 +50,7 @@ class Account:
     learnt: set[str]
     """Parameters that have a gradient."""
     pseudo: dict[str, dict[str, Any]]
-    """What became of the pictures that its augmenters asked for."""
+    """Accounts of the pictures that its augmenters requested."""
 
 
 def merge_gradients(run: Run, steps: Sequence[StepResult]) -> StepResult:
@@ -72,7 +72,7 @@ def merge_gradients(run: Run, steps: Sequence[StepResult]) -> StepResult:
         seen=run.ranks.gathered([seen for step in steps for seen in step.seen], run.device),
         dropped=sum(account.dropped for account in accounts),
         others=steps[1:],
-        pseudo=added_accounts([account.pseudo for account in accounts]),
+        pseudo=merge_accounts([account.pseudo for account in accounts]),
     )
 
 
@@ -94,3 +94,26 @@ def mean_terms(losses: Sequence[float], terms: Sequence[dict[str, float]]) -> di
     whole = [parts or {"own": loss} for loss, parts in zip(losses, terms, strict=True)]
     names = dict.fromkeys(name for parts in whole for name in parts)
     return {name: sum(parts.get(name, 0.0) for parts in whole) / len(whole) for name in names}
+
+
+def merge_accounts(accounts: Sequence[Mapping[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+    """Merges the accounts of several ranks into one, by augmenter (`augmenter.Accounting`)."""
+    merged = {}
+    for name in dict.fromkeys(name for by_name in accounts for name in by_name):
+        parts = [by_name[name] for by_name in accounts if name in by_name]
+        checks = dict.fromkeys(check for part in parts for check in part["warned"])
+        merged[name] = {
+            "event": parts[0]["event"],
+            "asked": sum_by_scale(part["asked"] for part in parts),
+            "dropped": sum_by_scale(part["dropped"] for part in parts),
+            "warned": {check: sum_by_scale(part["warned"].get(check, {}) for part in parts) for check in checks},
+        }
+    return merged
+
+
+def sum_by_scale(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """Adds counts of pictures up by scale."""
+    total: Counter[str] = Counter()
+    for count in counts:
+        total.update(count)
+    return dict(sorted(total.items(), key=lambda item: float(item[0])))

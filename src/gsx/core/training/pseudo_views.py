@@ -1,18 +1,15 @@
 """Pseudo details: pictures that nobody took, which training uses as truth for a while."""
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera, Frame
+from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.window import Window
-from gsx.core.files import replace_file
 from gsx.core.shapes import Float, UInt8
 
 
@@ -52,6 +49,8 @@ class Term:
     """Whether it moves parameters that all primitives share, such as a colour network (off: de-MLP)."""
     squared: bool = False
     """Differences are (render - target)^2 instead of the paper's |render - target|."""
+    made: Sequence[PseudoView] = ()
+    """Pseudo views of all training views that were made for this step."""
 
 
 def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool = False) -> Float[Tensor, ""]:
@@ -87,69 +86,3 @@ def kept_out(view: PseudoView, camera: Camera, windows: Sequence[Window]) -> Pse
     for part in seen:
         weight[part.pixels] = 0
     return replace(view, pixel_weight=weight, coarse=None)
-
-
-def picture_name(augmenter: str, view: PseudoView) -> str:
-    """File of what a pseudo view was made from, the result, and their difference, side by side."""
-    known = view.provenance
-    return f"{augmenter}_{known['event']:07d}_{view.parent}_x{known['scale']}_{known['kind']}.png"
-
-
-# -- files -------------------------------------------------------------------------------------------------------------
-
-
-def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -> None:
-    """Write pseudo views and `facts` as one safetensors file, whole or not at all."""
-    from safetensors.torch import save
-
-    tensors: dict[str, Tensor] = {}
-    listed = []
-    for number, view in enumerate(views):
-        held = {"target": view.target, "rotation": view.camera.rotation, "translation": view.camera.translation}
-        optional = {"trust": view.pixel_weight, "coarse": view.coarse}  # names that files have always had
-        held |= {name: value for name, value in optional.items() if value is not None}
-        tensors |= {
-            f"{number}.{name}": value.clone(memory_format=torch.contiguous_format) for name, value in held.items()
-        }
-        entry = {name: getattr(view, name) for name in ("parent", "coarse_weight", "provenance")}
-        numbers = {name: getattr(view.camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height", "near")}
-        frame = view.camera.cut_from
-        numbers["cut_from"] = None if frame is None else [frame.left, frame.top, frame.width, frame.height]
-        listed.append(entry | {"camera": numbers, "reduction": asdict(view.reduction)})
-    text = json.dumps({"facts": facts, "views": listed})
-    replace_file(path, save(tensors or {"none": torch.zeros(0)}, metadata={"gsx": text}))
-
-
-def load_views(path: Path) -> tuple[list[PseudoView], dict[str, Any]]:
-    """(views, facts) as `save_views` wrote them.
-
-    Raises:
-        OSError, ValueError: the file cannot be read.
-    """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt") as file:
-            content = json.loads(file.metadata()["gsx"])
-            names = set(file.keys())
-            tensors = {name: file.get_tensor(name) for name in names}
-    except SafetensorError as error:
-        raise ValueError(str(error)) from error
-    views = []
-    for number, entry in enumerate(content["views"]):
-        values = dict(entry["camera"])
-        if (frame := values.pop("cut_from")) is not None:
-            values["cut_from"] = Frame(left=frame[0], top=frame[1], width=frame[2], height=frame[3])
-        pose = {name: tensors[f"{number}.{name}"] for name in ("rotation", "translation")}
-        view = PseudoView(
-            camera=Camera(**pose, **values),
-            target=tensors[f"{number}.target"],
-            parent=entry["parent"],
-            pixel_weight=tensors.get(f"{number}.trust"),
-            coarse=tensors.get(f"{number}.coarse"),
-            coarse_weight=entry["coarse_weight"],
-            reduction=Reduction(**entry.get("reduction", {})),
-            provenance=entry["provenance"],
-        )
-        views.append(view)
-    return views, content["facts"]

@@ -1,6 +1,6 @@
 """A run: everything that belongs to one training, and one step as listeners see it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Protocol, runtime_checkable
@@ -8,7 +8,6 @@ from typing import Annotated, Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from gsx.augmenters.checked_regenerator import Tally
 from gsx.core.data.scene import Scene, View
 from gsx.core.device import uploaded
 from gsx.core.errors import Stopped
@@ -169,12 +168,8 @@ class Run:
     device: torch.device
     generator: torch.Generator
     sampler: Sampler
-    held_out: Callable[[float, int], list[Float[Tensor, "3 h w"]]] | None = None
-    """(share of the steps, seed) -> training views as shown by models that do not know them
-    (`RegeneratorContext.held_out`); None: the run is only looked at."""
-    augmenters: Sequence[Augmenter] = ()
-    tallies: Sequence[Tally] = ()
-    """What has become of the pictures that each augmenter asked for."""
+    augmenters: Mapping[str, Augmenter] = field(default_factory=dict)
+    """By name, in the order of their terms."""
     ranks: Ranks = Ranks()
     """The processes that train it together."""
     step: int = 0
@@ -277,7 +272,7 @@ class StepResult:
     terms: dict[str, float] = field(default_factory=dict)
     """Parts of the loss by name, as they enter it, where there is more than the backbone's own; mean over the batch."""
     pseudo: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """By augmenter, what became of the pictures that it asked for at this step (`Tally`); mostly none."""
+    """Accounts of the pictures requested at this step, by augmenter (`Accounting`); mostly none."""
     told: Told | None = None
     """What the host has heard of loss and gradients already; None: nothing."""
     skipped: str = ""

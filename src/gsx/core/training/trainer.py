@@ -1,7 +1,6 @@
 """The training loop. Density control, learning rates and the like live in backbones; everything else listens."""
 
 import logging
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -9,7 +8,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera
 from gsx.core.data.masks import blacked
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
@@ -17,14 +15,17 @@ from gsx.core.device import uploaded
 from gsx.core.errors import Stopped
 from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
-from gsx.core.rasterizer import Rendering, goes_compiled, rasterize
+from gsx.core.rasterizer import goes_compiled
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.backbone import Drawn, Observation, Validating, remove_nonfinite
+from gsx.core.training.augmenter import accounts_of
+from gsx.core.training.backbone import Observation, Validating, remove_nonfinite
+from gsx.core.training.forward import observe, render_for_training
 from gsx.core.training.importance import Probe
 from gsx.core.training.minibatch import gradients_added, merge_gradients, rollback_on_error
-from gsx.core.training.parameter_table import shared_colour, zero_grad
+from gsx.core.training.parameter_table import zero_grad
 from gsx.core.training.photographs import numbers_of
-from gsx.core.training.pseudo_views import PseudoView, Term, kept_out, pseudo_loss
+from gsx.core.training.pseudo_terms import backward_terms, request_terms, reusable_parts, reused_losses, without_windows
+from gsx.core.training.pseudo_views import Term
 from gsx.core.training.recorded import ToLearn
 from gsx.core.training.run import Run, StepResult
 from gsx.engine.compile_cache import waiting_counted
@@ -126,18 +127,16 @@ def backward(run: Run) -> StepResult:
     number = run.step + 1
     batch = run.sampler.take()
     picked = run.ranks.share(batch)
-    asked = [[augmenter.term(run, number, view) for augmenter in run.augmenters] for view in picked]
+    terms = request_terms(run, number, picked)
     colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
     views, steps = run.views.at(number), []
     run.exposures.forget()
     run.photographs.see(views)
-    for view, terms, colour in zip(picked, asked, colours, strict=True):
+    for view, of_view, colour in zip(picked, terms, colours, strict=True):
         run.refuse_if_stopping()
         with gradients_added(run.backbone.table):
-            given = [term for term in terms if term is not None]
-            steps.append(view_loss(run, number, views[view], given, colour))
-    told = {tally.name: tally.account_at(number) for tally in run.tallies}
-    steps[0] = replace(steps[0], pseudo={name: facts for name, facts in told.items() if facts})
+            steps.append(view_loss(run, number, views[view], of_view, colour))
+    steps[0] = replace(steps[0], pseudo=accounts_of(run, number))
     return steps[0] if len(batch) == 1 else merge_gradients(run, steps)
 
 
@@ -155,11 +154,11 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
         if step is not None:
             return step
     target = blacked(run.photographs.of(view), counted)
-    divided = [served_by_view(run, without(term, view.camera, windows), view.camera) for term in terms]
-    ordered = sorted(divided, key=lambda pair: pair[0].shared)
-    parts = {term.name: pseudo_term(run, term, number, seen) for term, _ in ordered}
+    allowed = [without_windows(term, view.camera, windows) for term in terms]
+    divided = [reusable_parts(term, view.camera, run.training.random_background) for term in allowed]
+    parts = backward_terms(run, [term for term, _ in divided], number, seen)
     own = 1 - sum(term.replaces for term in terms)
-    drawn, rendering = rendered(run, view.camera, number, colour)
+    drawn, rendering = render_for_training(run, view.camera, number, colour)
     compiled = goes_compiled(run.raster, run.device.type)
     shown = run.views.match_photo(rendering.image, target, view, learning=True)
     moments = run.photographs.moments_of(view, target, compiled) if counted is None else None
@@ -169,14 +168,12 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
         loss = loss + extra
     loss = loss if own == 1 else own * loss
     named = {"own": float(loss.detach())} | parts if parts else {}
-    for term, here in divided:
-        for pseudo, weight in here:
-            value = weight * pseudo_loss(rendering.image, pseudo, term.squared)
-            named[term.name] += float(value.detach())
-            loss = loss + value
+    for name, value in reused_losses(rendering.image, divided):
+        named[name] += float(value.detach())
+        loss = loss + value
     loss.backward()
-    served = sum(weight for _, here in divided for _, weight in here)
-    seen.append(observation(run, drawn, rendering, number, own + served))
+    served = sum(weight for _, reused in divided for _, weight in reused)
+    seen.append(observe(run, drawn, rendering, number, own + served))
     return StepResult(
         number=number,
         view=view,
@@ -220,7 +217,7 @@ def recorded_step(run: Run, number: int, view: View, colour: Float[Tensor, "3"])
         rendering=learnt.rendering,
         loss=learnt.loss,
         told=learnt.told,
-        seen=[observation(run, learnt.drawn, learnt.rendering, number, 1.0)],
+        seen=[observe(run, learnt.drawn, learnt.rendering, number, 1.0)],
         dropped=learnt.rendering.dropped,
     )
 
@@ -232,13 +229,6 @@ def withheld_windows(run: Run, view: View, number: int) -> list[Window]:
     return [window for window in withheld if window is not None]
 
 
-def without(term: Term, camera: Camera, windows: Sequence[Window]) -> Term:
-    """An augmenter's term without what its pseudo views show of windows of the training camera."""
-    if not windows:
-        return term
-    return replace(term, parts=[(kept_out(view, camera, windows), weight) for view, weight in term.parts])
-
-
 def counted_in_loss(view: View, windows: Sequence[Window]) -> Bool[Tensor, "H W"] | None:
     """Pixels that count: all but those masked, and those of windows that are kept to judge by."""
     counted = view.counted()
@@ -248,60 +238,6 @@ def counted_in_loss(view: View, windows: Sequence[Window]) -> Bool[Tensor, "H W"
     for window in windows:
         left[window.pixels] = False
     return left
-
-
-def rendered(run: Run, camera: Camera, number: int, colour: Float[Tensor, "3"]) -> tuple[Drawn, Rendering]:
-    """(what the backbone draws at this step, its render), to be learnt from; screen statistics are of the raster that
-    was drawn, the picture is reduced from it (`training.supersample`)."""
-    raster, absolute = run.views.raster_for(number)(camera), run.backbone.absolute_gradient
-    drawn = run.backbone.draw(raster.drawn_for, number)
-    rendering = rasterize(drawn.splats, raster.camera, run.raster, background=colour, absolute_gradient=absolute)
-    image, alpha = (raster.reduced(part) for part in (rendering.image, rendering.alpha[None]))
-    return drawn, replace(rendering, image=image, alpha=alpha[0])
-
-
-def served_by_view(run: Run, term: Term, camera: Camera) -> tuple[Term, Sequence[tuple[PseudoView, float]]]:
-    """(the term without them, its parts that need no render of their own): the camera draws just what these see.
-
-    Terms that density control is not to learn from have none: it could not tell their gradients from the view's own.
-    """
-    if run.training.random_background or not (term.shared and term.observed):
-        return term, ()
-    here = [part for part in term.parts if part[0].camera.draws_as(camera)]
-    return replace(term, parts=[part for part in term.parts if part not in here]), here
-
-
-def pseudo_term(run: Run, term: Term, number: int, seen: list[Observation]) -> float:
-    """Send an augmenter's term back; returns its value. What density control learns from it is appended to `seen`."""
-    total = 0.0
-    for view, weight in term.parts:
-        drawn, rendering = rendered(run, view.camera, number, run.background)
-        loss = weight * pseudo_loss(rendering.image, view, term.squared)
-        loss.backward()
-        total += float(loss.detach())
-        gradient = rendering.screen.means2d_offset.grad  # that of a step to be vetoed may not be finite
-        finite = math.isfinite(total) and (gradient is None or bool(torch.isfinite(gradient).all()))
-        if term.observed and finite:
-            seen.append(observation(run, drawn, rendering, number, weight))
-    if not term.shared:
-        for parameter in shared_colour(run.backbone.table):
-            parameter.grad = None
-    return total
-
-
-def observation(run: Run, drawn: Drawn, rendering: Rendering, number: int, weight: float) -> Observation:
-    """What density control learns from a render of that weight in the loss of its view; of weight 0 nothing.
-
-    The step's loss is the mean over the batch: the weight is divided by it, and the gradients of the screen means are,
-    as those of the parameters will be.
-    """
-    if not weight > 0:
-        return {}
-    views = run.training.batch
-    for moved in (rendering.screen.means2d_offset, rendering.screen.absgrad):
-        if views > 1 and moved is not None and moved.grad is not None:
-            moved.grad /= views
-    return run.backbone.observe(drawn, rendering, number, weight / views)
 
 
 def background(run: Run) -> Float[Tensor, "3"]:

@@ -16,7 +16,6 @@ from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
 from gsx.core.shapes import Float
 from gsx.core.training.finer_raster import FinerRaster, raster_at
-from gsx.core.training.pseudo_views import PseudoView
 from gsx.modules.bilateral_grid import WHOLE
 from gsx.modules.blur import Blur
 from gsx.modules.distractors import Distractors
@@ -47,8 +46,6 @@ class TrainingViews:
     """Of the photographs: all alike unless they are found to differ."""
     blur: Blur = field(default_factory=Blur)
     """Movements of their cameras: none unless they are found."""
-    closer: dict[str, Sequence[PseudoView]] = field(default_factory=dict)
-    """Pseudo views that are trained on at the moment, by augmenter."""
 
     def coarse_at(self, step: int) -> int:
         """How many times as coarse as the photographs the pictures of a step are."""
@@ -109,12 +106,3 @@ class TrainingViews:
         """Whether the next step renders at another resolution."""
         finer = self.supersample_at(step) != self.supersample_at(step + 1)
         return step > 0 and (finer or self.coarse_at(step) != self.coarse_at(step + 1))
-
-    def closer_after(self, step: int) -> list[PseudoView]:
-        """Pseudo views that were made for this step: late, where steps were left out after their event."""
-        return [view for views in self.closer.values() for view in views if made_after(view) == step - 1]
-
-
-def made_after(view: PseudoView) -> int | None:
-    """The last step of the model that a pseudo view was made from; None where nobody noted that."""
-    return view.provenance.get("made_after_step", view.provenance.get("event"))

@@ -4,8 +4,8 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from gsx.augmenters.checked_regenerator import added
 from gsx.core.plugins import hookimpl
+from gsx.core.training.minibatch import sum_by_scale
 from gsx.core.training.run import Run, StepResult
 
 logger = logging.getLogger(__name__)
@@ -114,12 +114,14 @@ def judged_blur(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def totals(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Pictures asked for, and shares dropped and warned of, by scale, over the events of an augmenter."""
-    asked = added(event["asked"] for event in events)
+    asked = sum_by_scale(event["asked"] for event in events)
     checks = dict.fromkeys(check for event in events for check in event["warned"])
     return {
         "asked": asked,
-        "dropped": shares(added(event["dropped"] for event in events), asked),
-        "warned": {check: shares(added(event["warned"].get(check, {}) for event in events), asked) for check in checks},
+        "dropped": shares(sum_by_scale(event["dropped"] for event in events), asked),
+        "warned": {
+            check: shares(sum_by_scale(event["warned"].get(check, {}) for event in events), asked) for check in checks
+        },
     }
 
 

@@ -3,17 +3,14 @@
 import logging
 import os
 import platform
-import weakref
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from gsx.augmenters.checked_regenerator import CheckedRegenerator, Tally, WithChecks
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.splats import Gaussians
@@ -31,7 +28,7 @@ from gsx.engine.cache import MANIFEST, cache_folder, content_key, make_folder
 from gsx.engine.compiled import path_of
 from gsx.engine.machine import processor_kind
 from gsx.experiments.run_folder.general_options import splat_file
-from gsx.experiments.runs.halves import held_out_renders
+from gsx.experiments.runs.halves import Anew, held_out_renders
 from gsx.experiments.runs.rasterizer_path import decide
 from gsx.experiments.runs.settings import Chosen, Settings
 from gsx.experiments.runs.start_file import go_on_from, in_front_of, one_point
@@ -172,8 +169,7 @@ def build(
         go_on_from(backbone, start or stand_in, settings.backbone.component.name)
     else:
         backbone = anew(scene, general.iterations, generator, own, ranks, begins)
-    augmenters = build_augmenters(settings, scene) if training else []
-    run = Run(
+    return Run(
         config=settings.resolved,
         folder=folder,
         scene=scene,
@@ -187,19 +183,9 @@ def build(
         sampler=Sampler(len(scene.train), general.seed, batch=settings.training.batch),
         photograph_bytes=room_for_photographs(device) if training else 0,
         recorder=recorder_of(backbone, settings.training, device) if training else None,
-        augmenters=[augmenter for augmenter, _ in augmenters],
-        tallies=[tally for _, tally in augmenters],
+        augmenters=build_augmenters(settings, scene, anew) if training else {},
         ranks=ranks,
     )
-    itself = weakref.ref(run)  # a circle would keep a finished run's tensors for a while
-
-    def held_out(share: float, seed: int) -> list[Tensor]:
-        run = itself()
-        assert run is not None
-        return held_out_renders(run, anew, share, seed)
-
-    run.held_out = held_out if training else None
-    return run
 
 
 def backbone_of(
@@ -239,41 +225,30 @@ def recorder_of(backbone: Backbone, training: TrainingOptions, device: torch.dev
     return None
 
 
-def build_augmenters(settings: Settings, scene: Scene) -> list[tuple[Augmenter, Tally]]:
-    """The augmenters of a run, in order, and what becomes of their pictures; they share regenerators by role.
+def build_augmenters(settings: Settings, scene: Scene, anew: Anew) -> dict[str, Augmenter]:
+    """Builds the augmenters of a run, in order; they share regenerators by role.
 
     Raises:
         ConfigError: together they replace the whole loss of the photographs.
     """
-    built: dict[str, Regenerator] = {}
-    out = [augmenter_of(name, chosen, settings, scene, built) for name, chosen in settings.augmenters.items()]
-    shares = {tally.name: augmenter.share() for augmenter, tally in out if isinstance(augmenter, Replacing)}
+    regenerator = cache(partial(regenerator_of, settings=settings))
+    augmenters: dict[str, Augmenter] = {}
+    for name, chosen in settings.augmenters.items():
+        context = AugmenterContext(
+            name=name,
+            scene=scene,
+            iterations=settings.general.iterations,
+            seed=settings.general.seed,
+            regenerator=regenerator,
+            checks=settings.checks,
+            held_out=lambda run, share, seed: held_out_renders(run, anew, share, seed),
+        )
+        augmenters[name] = chosen.component.factory(chosen.options, context)
+    shares = {name: augmenter.share() for name, augmenter in augmenters.items() if isinstance(augmenter, Replacing)}
     if sum(shares.values()) >= 1:
         listed = ", ".join(f"{name} {share:g}" for name, share in shares.items())
         raise ConfigError(f"augmenters take the whole loss of the photographs ({listed}): lower their weights")
-    return out
-
-
-def augmenter_of(
-    name: str, chosen: Chosen, settings: Settings, scene: Scene, built: dict[str, Regenerator]
-) -> tuple[Augmenter, Tally]:
-    """An augmenter, and the tally of its pictures; `built`: regenerators by role, so far."""
-    own, tally = chosen.options if isinstance(chosen.options, WithChecks) else None, Tally(name=name)
-
-    def regenerator(role: str) -> CheckedRegenerator:
-        inner = built[role] = built.get(role) or regenerator_of(role, settings)
-        where = f"augmenter.{name}.checks" if own else f"checks.{role}"
-        tally.remedies = list(dict.fromkeys([*tally.remedies, f"choose another regenerator/{role}", f"loosen {where}"]))
-        return CheckedRegenerator(inner=inner, checks=own.checks if own else settings.checks[role], tally=tally)
-
-    context = AugmenterContext(
-        name=name,
-        scene=scene,
-        iterations=settings.general.iterations,
-        seed=settings.general.seed,
-        regenerator=regenerator,
-    )
-    return chosen.component.factory(chosen.options, context), tally
+    return augmenters
 
 
 def regenerator_of(role: str, settings: Settings) -> Regenerator:
@@ -290,8 +265,7 @@ def regenerator_of(role: str, settings: Settings) -> Regenerator:
 
 def plan_of(run: Run) -> dict[str, Any]:
     """The rescaled schedules of the backbone, of the loop and of the augmenters."""
-    names = run.config.get("augmenter") or {}
     own = run.backbone.plan() if isinstance(run.backbone, Planned) else {}
     if not all(isinstance(part, Mapping) for part in own.values()):
         own = {run.config["backbone"]["name"]: own}
-    return own | run.plateau.plan() | {name: a.plan() for name, a in zip(names, run.augmenters, strict=True)}
+    return own | run.plateau.plan() | {name: augmenter.plan() for name, augmenter in run.augmenters.items()}

@@ -15,6 +15,7 @@ from gsx.core.packages import require
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training import checkpoint
+from gsx.core.training.augmenter import recall_accounts
 from gsx.core.training.distributed import ranks_here
 from gsx.core.training.run import Run
 from gsx.engine.cache import source_revision
@@ -205,8 +206,7 @@ def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     if run.raster.training_focal and is_number(focal):  # the scene may be looked at in another size
         run.raster = run.backbone.raster = replace(run.raster, training_focal=float(focal))
     run.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
-    for tally in run.tallies:
-        tally.recall(run.curves)
+    recall_accounts(run.augmenters, run.curves)
     return run
 
 

@@ -4,9 +4,10 @@ import logging
 from pathlib import Path
 from typing import Any
 
+from gsx.augmenters.store import load_views, picture_name
 from gsx.core.data.images import write_image
 from gsx.core.files import write_json
-from gsx.core.training.pseudo_views import PseudoView, load_views, picture_name
+from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.evaluator import EvalOptions

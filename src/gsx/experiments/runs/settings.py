@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsx.augmenters.checked_regenerator import Checks, WithChecks
+from gsx.augmenters.checks import Checks, WithChecks
 from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.files import at_home
 from gsx.core.options import fields_with

@@ -42,7 +42,7 @@ SHARES = (10 / 40, 15 / 40, 20 / 40, 22 / 40, 30 / 40)
 
 def common_steps(run: Run) -> int:
     """Steps that the run shares with its baseline: up to the first pseudo views, or all of them."""
-    return min([run.iterations, *(augmenter.begins() for augmenter in run.augmenters)])
+    return min([run.iterations, *(augmenter.begins() for augmenter in run.augmenters.values())])
 
 
 def warm_start_folder(run: Run, idle: Collection[str], plugins: Mapping[str, str]) -> Path:

@@ -1,0 +1,80 @@
+"""Terms of augmenters in the loss of a training view: their pseudo views are rendered, compared and learnt from."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.window import Window
+from gsx.core.shapes import Float
+from gsx.core.training.backbone import Observation, PseudoViewListener
+from gsx.core.training.forward import observe, render_for_training
+from gsx.core.training.parameter_table import shared_colour
+from gsx.core.training.pseudo_views import PseudoView, Term, kept_out, pseudo_loss
+from gsx.core.training.run import Run
+
+Divided: TypeAlias = tuple[Term, Sequence[tuple[PseudoView, float]]]
+"""(a term, the parts of it that the training view's render serves)"""
+
+
+def request_terms(run: Run, step: int, views: Sequence[int]) -> list[list[Term]]:
+    """Asks the augmenters for their terms for each training view, and hands new pseudo views to the backbone."""
+    requested = [[augmenter.term(run, step, view) for augmenter in run.augmenters.values()] for view in views]
+    terms = [[term for term in of_view if term is not None] for of_view in requested]
+    if isinstance(run.backbone, PseudoViewListener):
+        made = [pseudo for of_view in terms for term in of_view for pseudo in term.made]
+        run.backbone.pseudo_views_made(made, step)
+    return [[term for term in of_view if term.parts] for of_view in terms]
+
+
+def without_windows(term: Term, camera: Camera, windows: Sequence[Window]) -> Term:
+    """Removes what the pseudo views of a term show of windows of the training camera."""
+    if not windows:
+        return term
+    return replace(term, parts=[(kept_out(view, camera, windows), weight) for view, weight in term.parts])
+
+
+def reusable_parts(term: Term, camera: Camera, random_background: bool) -> Divided:
+    """Separates the parts of a term that the render of the training view serves: their cameras draw just that.
+
+    Terms that density control does not learn from have none: it could not tell their gradients from the view's.
+    """
+    if random_background or not (term.shared and term.observed):
+        return term, ()
+    reused = [part for part in term.parts if part[0].camera.draws_as(camera)]
+    return replace(term, parts=[part for part in term.parts if part not in reused]), reused
+
+
+def backward_terms(run: Run, terms: Sequence[Term], step: int, observations: list[Observation]) -> dict[str, float]:
+    """Sends terms back, first those that leave shared parameters alone; returns their values by name."""
+    ordered = sorted(terms, key=lambda term: term.shared)
+    return {term.name: backward_term(run, term, step, observations) for term in ordered}
+
+
+def backward_term(run: Run, term: Term, step: int, observations: list[Observation]) -> float:
+    """Sends a term back and returns its value; appends what density control learns from its renders."""
+    total = 0.0
+    for view, weight in term.parts:
+        drawn, rendering = render_for_training(run, view.camera, step, run.background)
+        loss = weight * pseudo_loss(rendering.image, view, term.squared)
+        loss.backward()
+        total += float(loss.detach())
+        gradient = rendering.screen.means2d_offset.grad  # that of a step to be vetoed may not be finite
+        finite = math.isfinite(total) and (gradient is None or bool(torch.isfinite(gradient).all()))
+        if term.observed and finite:
+            observations.append(observe(run, drawn, rendering, step, weight))
+    if not term.shared:
+        for parameter in shared_colour(run.backbone.table):
+            parameter.grad = None
+    return total
+
+
+def reused_losses(image: Float[Tensor, "3 H W"], divided: Sequence[Divided]) -> Iterator[tuple[str, Tensor]]:
+    """Yields (name of the term, loss) of each pseudo view that is compared with the training view's render."""
+    for term, reused in divided:
+        for pseudo, weight in reused:
+            yield term.name, weight * pseudo_loss(image, pseudo, term.squared)
