@@ -4,9 +4,7 @@ Where the host would have to wait for a GPU is counted, as are the kernels that 
 devices in one operation are refused as CUDA refuses them. What would be compiled runs as it stands and counts as one
 launch, though it may be several.
 
-    python tests/stand_in_gpu.py CASE [/ CASE]...   # steps on the CPU, then there: losses and counts of each case
-
-A CASE is [--recorded|--broken|--second-broken] [--sizes] OVERRIDES; --sizes: photographs are of three.
+    python tests/stand_in_gpu.py OVERRIDES [/ OVERRIDES]...   # steps on the CPU, then there: losses and counts of each
 """
 
 import json
@@ -14,7 +12,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,12 +24,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsx.builtin import plugins
-from gsx.core.data.scene import Scene
-from gsx.core.rasterizer import ListSizes
 from gsx.core.training.guard import Guard
-from gsx.core.training.parameter_table import ParameterTable, gradients, zero_grad
-from gsx.core.training.recorded import Learnt, Recorder
-from gsx.core.training.run import Run
 from gsx.core.training.trainer import train_step
 from gsx.experiments.runs import build
 from gsx.experiments.runs.load_scene import load_scene
@@ -46,11 +39,8 @@ FREE = {"detach", "view", "_unsafe_view", "expand", "permute", "transpose", "t",
         "empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "lift_fresh", "narrow", "diagonal",
         "_local_scalar_dense"}  # fmt: skip
 """Operations that launch nothing."""
-STEPS, RECORDED, SIZES, BROKEN = 4, 15, 9, 5
-"""Steps taken; steps where some are recorded: density control changes the model at the 6th and 12th of them; where
-photographs are of three sizes; and where none can be."""
-ROOM = ListSizes(rows=1 << 12, pairs=1 << 14, blocks=1 << 12, longest=1 << 8)
-"""More than any list of the tiny scene needs."""
+STEPS = 4
+"""Steps of a case."""
 
 
 @dataclass
@@ -61,14 +51,6 @@ class Tally:
     launches: Counter[str] = field(default_factory=Counter)
     inside: str = ""
     """Compiled function under way."""
-    failed: int = 0
-    """Recordings that did."""
-    made: int = 0
-    """Recordings."""
-    replayed: int = 0
-    """How often."""
-    recording: bool = False
-    """A graph is recorded or replayed: the host has no part in it."""
 
     def note(self, counts: Counter[str], name: str, so: bool) -> None:
         """Count an operation, if it is so."""
@@ -156,7 +138,6 @@ class Watched(TorchDispatchMode):
             kwargs["device"] = "cpu"
         moved = name in ("_to_copy", "copy_") and (not onto or len(ours) < len(tensors))
         if moved:
-            assert not self.tally.recording, f"{name} {asked_by()}: a copy between devices within a graph"
             waiting = not (kwargs.get("non_blocking") or (name == "copy_" and len(args) > 2 and args[2]))
             self.tally.note(self.tally.waits, name, waiting)
         else:
@@ -260,142 +241,31 @@ def stand_in() -> Iterator[Tally]:
         yield tally
 
 
-class Again:
-    """In place of a CUDA graph: does the work again, and copies what it makes to where it was made first."""
-
-    def __init__(self, work: Callable[[], Learnt], table: ParameterTable, tally: Tally) -> None:
-        self.work, self.table, self.tally = work, table, tally
-        with self.as_graph():
-            self.made = work()
-        self.gradients, self.read = gradients(table), self.reads()
-
-    def reads(self) -> set[int]:
-        """Tensors of the table that the work reads: a graph goes on reading those that it was recorded with."""
-        return {id(tensor) for tensor in (*self.table.parameters.values(), *self.table.columns.values())}
-
-    @contextmanager
-    def as_graph(self) -> Iterator[None]:
-        """One launch, without any part of the host."""
-        waits, self.tally.recording = sum(self.tally.waits.values()), True
-        try:
-            with one_launch(self.tally, "graph"):
-                yield
-        finally:
-            self.tally.recording = False
-        assert sum(self.tally.waits.values()) == waits, f"recorded work waits: {+self.tally.waits}"
-
-    def tensors(self, made: Learnt, found: dict[str, Tensor]) -> list[Tensor]:
-        """All that is read of a recorded step."""
-        rendering, screen = made.rendering, made.rendering.screen
-        moved = [screen.means2d_offset, *([] if screen.absgrad is None else [screen.absgrad])]
-        shown = [made.loss, made.facts, rendering.image, rendering.alpha, rendering.needed, screen.ids, screen.radii]
-        return [*(value.detach() for value in shown), *(value.grad for value in moved), *found.values()]
-
-    def replay(self) -> None:
-        self.tally.replayed += 1
-        assert self.reads() == self.read, "a graph is replayed on a table that it was not recorded with"
-        zero_grad(self.table)
-        places = self.tensors(self.made, self.gradients)
-        with self.as_graph():
-            for place, value in zip(places, self.tensors(self.work(), gradients(self.table)), strict=True):
-                place.copy_(value)
-
-
-def recording(run: Run, tally: Tally, most: int | None, roomy: bool) -> Recorder:
-    """A recorder whose graphs are no graphs, of which `most` can be made; `roomy`: it need not find how much room lists
-    need."""
-
-    def record(work: Callable[[], Learnt]) -> tuple[Learnt, Again]:
-        if tally.made == most:
-            work()
-            tally.failed += 1
-            raise RuntimeError("operation not permitted when stream is capturing")
-        tally.made += 1
-        again = Again(work, run.backbone.table, tally)
-        return again.made, again
-
-    room = {"room": ROOM} if roomy else {}
-    return Recorder(backbone=run.backbone, ssim_weight=run.training.ssim_weight, record=record, **room)
-
-
-def in_three_sizes(scene: Scene) -> Scene:
-    """Its photographs, two of three of them cut off at the right."""
-    cut = [replace(v, camera=v.camera.crop(0, 0, 48 - 12 * (i % 3), 36)) for i, v in enumerate(scene.train)]
-    return replace(scene, train=cut)
-
-
-def steps(
-    words: list[str],
-    device: torch.device,
-    count: int = STEPS,
-    begun: Callable[[], None] = lambda: None,
-    recorded: Tally | None = None,
-    most: int | None = None,
-    sizes: bool = False,
-) -> list[Tensor]:
-    """Losses of the first steps of a tiny run; `begun` is called before each. `recorded`: the tally, where steps are to
-    be recorded; `most`: which fails after so many; `sizes`: of photographs of three sizes."""
-    loaded, losses = plugins(), list[Tensor]()
+def losses(words: list[str], device: torch.device, begin: Callable[[], None] = lambda: None) -> list[Tensor]:
+    """Losses of the first steps of a tiny run; `begin` is called before each."""
+    loaded, values = plugins(), list[Tensor]()
     with TemporaryDirectory() as folder, patch.object(build, "choose_device", lambda _: device):
         settings = tiny_settings(Path(folder), "iterations=100", *words)
-        scene = load_scene(settings)
-        run = build.build(settings, in_three_sizes(scene) if sizes else scene, Path(folder), training=True)
-        run.recorder = recording(run, recorded, most, roomy=sizes) if recorded else None
+        run = build.build(settings, load_scene(settings), Path(folder), training=True)
         with loaded.listening([Guard()]):
-            for _ in range(count):
-                begun()
-                losses.append(train_step(run, loaded).loss)
-    return losses
-
-
-@dataclass(frozen=True)
-class Case:
-    """What is asked of the device."""
-
-    words: list[str]
-    recorded: bool
-    most: int | None
-    """Kinds of steps that can be recorded; None: all."""
-    sizes: bool
-
-    @classmethod
-    def of(cls, words: list[str]) -> "Case":
-        """From words of the command line."""
-        flags = {word for word in words if word.startswith("--")}
-        return cls(
-            [word for word in words if word not in flags],
-            recorded=bool(flags & {"--recorded", "--broken", "--second-broken"}),
-            most=0 if "--broken" in flags else 1 if "--second-broken" in flags else None,
-            sizes="--sizes" in flags,
-        )
-
-    @property
-    def count(self) -> int:
-        """Steps."""
-        return BROKEN if self.most == 0 else SIZES if self.sizes else RECORDED if self.recorded else STEPS
-
-    def on_cpu(self) -> list[Tensor]:
-        """Losses there."""
-        return steps([*self.words, "rasterizer=eager"], torch.device("cpu"), sizes=self.sizes)
-
-    def on_device(self, tally: Tally, own: list[Tensor]) -> dict[str, Any]:
-        """Losses of all kinds, and counts of the last step."""
-        words = [*self.words, "rasterizer=compiled"]
-        recorded, tally.failed, tally.made, tally.replayed = tally if self.recorded else None, 0, 0, 0
-        found = {"device": steps(words, DEVICE, self.count, tally.begin, recorded, self.most, self.sizes)}
-        counts = {"waits": tally.waits.copy(), "launches": tally.launches.copy()}
-        counts |= {"failed": tally.failed, "made": tally.made, "replayed": tally.replayed}
-        found |= {"unrecorded": steps(words, DEVICE, self.count, sizes=self.sizes)} if recorded else {}
-        return {name: [float(loss) for loss in by] for name, by in ({"cpu": own} | found).items()} | counts
+            for _ in range(STEPS):
+                begin()
+                values.append(train_step(run, loaded).loss)
+    return values
 
 
 def main(words: list[str]) -> None:
-    """What is told of each case, as JSON."""
-    cases = [Case.of(part.split("\n")) for part in "\n".join(words).split("\n/\n")]
-    own = [case.on_cpu() for case in cases]
+    """Prints losses on the CPU and on the device and the counts of the last step of each case, as JSON."""
+    cases = [part.split("\n") for part in "\n".join(words).split("\n/\n")]
+    own = [losses([*case, "rasterizer=eager"], torch.device("cpu")) for case in cases]
+    found = []
     with stand_in() as tally, patch.object(build, "decide", lambda raster, *_: raster):
-        told = [case.on_device(tally, losses) for case, losses in zip(cases, own, strict=True)]
-    print(json.dumps(told, indent=1))
+        for case, on_cpu in zip(cases, own, strict=True):
+            on_device = losses([*case, "rasterizer=compiled"], DEVICE, tally.begin)
+            counts = {"waits": tally.waits.copy(), "launches": tally.launches.copy()}
+            both = {"cpu": on_cpu, "device": on_device}
+            found.append({name: [float(loss) for loss in values] for name, values in both.items()} | counts)
+    print(json.dumps(found, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Whole training steps: eager, compiled and, on a GPU, recorded in turn, on the same views of the same model."""
+"""Times whole training steps, eager and compiled in turn, on the same views of the same model."""
 
 from dataclasses import replace
 from itertools import cycle
@@ -7,7 +7,6 @@ from pathlib import Path
 from gsx.builtin import plugins
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.training.recorded import Recorder
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import train_step
 from gsx.experiments.runs.build import build
@@ -49,12 +48,12 @@ def raster_of(run: Run, path: str) -> RasterSettings:
     return replace(run.raster, path=shipped.path, chunk=shipped.chunk, batch_values=shipped.batch_values)
 
 
-def stepping(run: Run, loaded: Plugins, raster: RasterSettings, recorder: Recorder | None = None) -> Job:
+def stepping(run: Run, loaded: Plugins, raster: RasterSettings) -> Job:
     """A job that takes the next training step; every such job walks through the same views."""
     views = cycle(range(min(VIEWS, len(run.scene.train))))
 
     def job(watch: Watch) -> None:
-        run.raster, run.recorder = raster, recorder
+        run.raster = raster
         run.sampler.order.append(next(views))
         watch.begin()
         train_step(run, loaded)
@@ -71,10 +70,6 @@ def step_section(bench: Bench) -> Section:
     for view in run.scene.train[:VIEWS]:
         view.image()  # decoded now, not in the first path's turn
     jobs = {path: stepping(run, loaded, raster_of(run, path)) for path in bench.paths}
-    if bench.device.type == "cuda" and "compiled" in bench.paths:
-        recorder = Recorder(backbone=run.backbone, ssim_weight=run.training.ssim_weight)
-        if recorder.alike(run.step + 1) is not None:
-            jobs["recorded"] = stepping(run, loaded, raster_of(run, "compiled"), recorder)
     patience = Patience(bench.pick(STEPS, QUICK_STEPS), 4 * bench.patience.seconds)
     rows = step_rows(take_turns(jobs, bench.device, patience))
     name = run.scene.name if bench.run is None else f"{run.scene.name}, run {bench.run.name}"

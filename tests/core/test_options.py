@@ -63,7 +63,6 @@ def test_keys_that_change_no_training_are_those_that_are_written_down() -> None:
         ["scene=photos", "regenerator/upscale=sd_by_scale", "regenerator/restore=scene_restorer"], plugins()
     )
     own = {f"training.{name}" for name in ("log_every", "checkpoint_every", "checkpoints_kept", "test_points")}
-    own.add("training.cuda_graphs")
     own |= {f"scene.{name}" for name in ("path", "iterations", "cache_gb", "missing")}
     for model in ("x2", "x4"):
         for name in ("cached", "download", "offload", "batch_pixels", "slicing"):

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -14,16 +13,7 @@ from raster_scenes import changed, errors_of, front_camera, leaves, random_splat
 
 from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer import (
-    FixedLists,
-    Needed,
-    RasterSettings,
-    Rendering,
-    checked_lens,
-    rasterize,
-    rasterize_fixed,
-)
-from gsx.core.rasterizer.intersections import raster_numbers
+from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.engine import compiled, lanes
 from gsx.engine.compile_cache import TRACING, file_of, recorded
 from gsx.engine.compiled import Chunks, Rows, Stage, available, room_for_gradients, takes
@@ -156,43 +146,6 @@ def test_absolute_gradient_is_that_of_the_eager_path(monkeypatch: pytest.MonkeyP
     in_pieces = probe("compiled")
     assert (in_pieces - eager).norm() <= 1e-5 * eager.norm()
     assert not torch.equal(in_pieces, whole)
-
-
-def learnt_by(draw: Callable[[Splats], Rendering]) -> tuple[Rendering, list[torch.Tensor]]:
-    """(a picture of splats some of which lie behind the camera and one nowhere, its gradients)."""
-    splats = random_splats(300, seed=4, channels=4)
-    splats.means[:20, 2] -= 20
-    splats.means[20] = torch.nan
-    given = leaves(splats)
-    rendering = draw(given)
-    weights = torch.randn(rendering.image.shape, generator=torch.Generator().manual_seed(0))
-    (rendering.image * weights).sum().backward()
-    return rendering, [value.grad for value in vars(given).values() if value.grad is not None]
-
-
-@pytest.mark.parametrize("spare", [1, 400])
-def test_lists_of_fixed_sizes_draw_the_same_bits(spare: int) -> None:
-    camera, rules = front_camera(), replace(QUICK, schedule="segments")
-    wanted = {"background": torch.zeros(4), "absolute_gradient": True}
-    usual, slopes = learnt_by(lambda given: rasterize(given, camera, rules, **wanted))
-    room = {"rows": 1, "pairs": 1, "blocks": 1, "longest": 1}
-    for _ in range(5):  # what one list lacks hides what the next needs
-        numbers = raster_numbers(camera, rules, torch.device("cpu"))
-        fixed = FixedLists(lens=checked_lens(camera, rules), raster=numbers, **room)
-        drawn, others = learnt_by(lambda given, fixed=fixed: rasterize_fixed(given, camera, rules, fixed, **wanted))
-        needed = Needed(*drawn.needed.tolist())
-        if fixed.hold(needed):
-            break
-        room = {name: getattr(needed, name) + spare for name in room}
-    assert fixed.hold(needed)
-    assert (needed.pairs, needed.dropped) == (usual.intersections, usual.dropped) == (usual.intersections, 1)
-    assert torch.equal(drawn.image, usual.image)
-    assert all(torch.equal(one, other) for one, other in zip(slopes, others, strict=True))
-    assert torch.equal(drawn.screen.radii[usual.screen.ids], usual.screen.radii)
-    assert int(drawn.screen.visible.sum()) == int(usual.screen.visible.sum())
-    for name in ("means2d_offset", "absgrad"):
-        moved = getattr(drawn.screen, name).grad
-        assert torch.equal(moved[usual.screen.ids], getattr(usual.screen, name).grad)
 
 
 @pytest.mark.parametrize("left", [61, 50, 17])

@@ -1,7 +1,7 @@
 """3D Gaussian Splatting (Kerbl et al. 2023): explicit Gaussians with adaptive density control (3D-GS)."""
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -151,10 +151,6 @@ class GS3D:
         """SH degree at a step (3D-GS, sh_utils.py)."""
         grown = step // max(1, self.schedule.step(self.options.sh_every))
         return max(self.first_degree, min(self.options.sh_degree, grown))
-
-    def drawn_alike(self, step: int) -> Hashable:
-        """The SH degree, where every camera draws every Gaussian (`core.training.recorded`)."""
-        return self.active_degree(step) if isinstance(self.visibility, AllVisible) else None
 
     def draw(self, camera: Camera, step: int) -> DrawnSplats:
         """The Gaussians that the camera draws, with their colours as seen from there."""

@@ -13,7 +13,6 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from gsx.core.rasterizer.fixed_lists import FixedLists
 from gsx.core.rasterizer.grid import Basis, TileGrid, basis_of, inside_of
 from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
 from gsx.core.rasterizer.precision import Precision
@@ -298,18 +297,16 @@ def composite_compiled(
     settings: RasterSettings,
     *,
     absgrad: Float[Tensor, "M 2"] | None = None,
-    fixed: FixedLists | None = None,
-) -> tuple[Float[Tensor, "C_plus_1 H W"], Int[Tensor, "2"] | None]:
-    """(what `composite` returns, through compiled loops; by segments, how many blocks are needed in all and of one
-    tile). `absgrad` as there. There must be a pair."""
+) -> Float[Tensor, "C_plus_1 H W"]:
+    """Blends like `composite`, through compiled loops. `absgrad` as there. There must be a pair."""
     precision = Precision.of(settings, means.dtype)
     rules = rules_of(settings, channels.shape[1], absgrad is not None, precision.evaluation, means.device.type)
     values = settings.compiled_values or (VALUES if means.device.type == "cpu" else VALUES_OF_A_GPU)
     if settings.schedule == "segments" or (settings.schedule == "auto" and means.device.type != "cpu"):
         table = padded_table(means, conic_factors, log_opacities, channels)
-        segments, needed = cut(intersections, len(means), settings.unrolled, fixed)
+        segments = cut(intersections, len(means), settings.unrolled)
         work = segment_job(segments, grid, rules, precision, values, means.device)
-        return SegmentComposite.apply(table, absgrad, intersections, work), needed
+        return SegmentComposite.apply(table, absgrad, intersections, work)
     batch = max(2, values // (settings.unrolled * settings.tile_size**2 * LANES))
     given = means, conic_factors, log_opacities, channels, absgrad
     learning = torch.is_grad_enabled() and any(value is not None and value.requires_grad for value in given)
@@ -327,7 +324,7 @@ def composite_compiled(
         batch=batch,
         learning=learning,
     )
-    return CompiledComposite.apply(means, conic_factors, log_opacities, channels, absgrad, intersections, job), None
+    return CompiledComposite.apply(means, conic_factors, log_opacities, channels, absgrad, intersections, job)
 
 
 # -- when? --------------------------------------------------------------------------------------------------------

@@ -1,8 +1,7 @@
 """The segment schedule: blocks of all tiles at once, in few large kernels, which is what a GPU wants.
 
 The share of light that passes each block comes first; an associative scan makes of it the transmittance before every
-block; then all blocks are blended at once, and summed by tile. On the way back the scan runs from behind. The sizes of
-all lists may be given beforehand (`FixedLists`): then the host waits for nothing.
+block; then all blocks are blended at once, and summed by tile. On the way back the scan runs from behind.
 """
 
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ import torch
 from torch import Tensor
 
 from gsx.core.rasterizer.bags import bag_sums, edges_of
-from gsx.core.rasterizer.fixed_lists import FixedLists
 from gsx.core.rasterizer.grid import TileGrid, basis_of
 from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
 from gsx.core.rasterizer.precision import Precision
@@ -41,39 +39,28 @@ class Segments:
     """First block of each tile, then one past the last."""
     places: Int[Tensor, "P"]
     """Entry of each pair, pairs sorted by splat."""
-    spare: bool
-    """Whether there may be more blocks than are needed, because sizes were given."""
     doublings: int
     """How often 1 has to be doubled to reach the number of blocks of any tile."""
 
 
-def cut(
-    intersections: TileIntersections, splats: int, chunk: int, fixed: FixedLists | None
-) -> tuple[Segments, Int[Tensor, "2"]]:
-    """(lists in blocks of `chunk`, how many blocks they have in all and at most); `splats` is the number of screen
-    splats.
-
-    Where a list has no room, because sizes were given, all that has none shares the last entry.
-    """
+def cut(intersections: TileIntersections, splats: int, chunk: int) -> Segments:
+    """Cuts lists into blocks of `chunk`; `splats` is the number of screen splats."""
     counts = torch.div(intersections.starts.diff() + (chunk - 1), chunk, rounding_mode="floor")
     edges = edges_of(counts)
-    needed = torch.stack([edges[-1], counts.amax()])
-    total, most = (fixed.blocks, fixed.longest) if fixed else needed.tolist()
+    total, most = torch.stack([edges[-1], counts.amax()]).tolist()
     size = max(LEAST_BLOCKS, total)
-    place = entry_places(edges, intersections.starts, intersections.tiles, chunk).clamp_max(size * chunk - 1)
+    place = entry_places(edges, intersections.starts, intersections.tiles, chunk)
     number, left, tiles = within_tiles(blocks_tiles(edges, size), edges)
     listed = intersections.splats
-    segments = Segments(
+    return Segments(
         entries=listed.new_full((size * chunk,), splats).scatter_(0, place, listed).view(size, chunk),
         tiles=tiles,
         number=number,
         left=left,
         edges=edges,
         places=torch.empty_like(place).scatter_(0, intersections.slots, place),
-        spare=fixed is not None,
         doublings=max(1, most - 1).bit_length(),
     )
-    return segments, needed
 
 
 def blocks_tiles(edges: Int[Tensor, "T_1"], size: int) -> Int[Tensor, "S"]:
@@ -85,7 +72,7 @@ def blocks_tiles(edges: Int[Tensor, "T_1"], size: int) -> Int[Tensor, "S"]:
 def entry_places(
     edges: Int[Tensor, "T_1"], starts: Int[Tensor, "T_1"], tiles: Int[Tensor, "P"], chunk: int
 ) -> Int[Tensor, "P"]:
-    """Entry of each pair. Pairs beyond the lists have no tile: theirs is one past the last."""
+    """Entry of each pair."""
     return torch.arange(tiles.shape[0], device=tiles.device) + (edges * chunk - starts)[tiles]
 
 
@@ -222,7 +209,7 @@ def blend_segments(job: SegmentJob, table: Float[Tensor, "M_1 F"]) -> tuple[Floa
 def sum_by_tile(values: Float[Tensor, "S P"], segments: Segments) -> Float[Tensor, "T P"]:
     """Sums over the blocks of each tile."""
     blocks = torch.arange(len(values), device=values.device)
-    return bag_sums(values, blocks, segments.edges, segments.spare)
+    return bag_sums(values, blocks, segments.edges)
 
 
 def segment_moments(job: SegmentJob, kept: Kept, gradient: Float[Tensor, "T C_1 P"]) -> Float[Tensor, "S K V"]:

@@ -169,26 +169,6 @@ class Camera:
         return ((points - self.translation.double()) @ self.rotation.double()).float()
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PlacedCamera(Camera):
-    """A camera whose pose lies on a device, with its centre as it was found where the pose came from."""
-
-    stands_at: Float[Tensor, "3"]
-
-    @property
-    def centre(self) -> Float[Tensor, "3"]:
-        """Camera centre in world coordinates."""
-        return self.stands_at
-
-
-def on_device(
-    camera: Camera, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"], centre: Float[Tensor, "3"]
-) -> PlacedCamera:
-    """The camera's raster and intrinsics with a pose that is read from these tensors."""
-    pose = {"rotation": rotation, "translation": translation, "stands_at": centre}
-    return PlacedCamera(**(vars(camera) | pose))
-
-
 def offsets_from(points: Float[Tensor, "P 3"], centre: Float[Tensor, "3"]) -> Float[Tensor, "P 3"]:
     """points - centre, subtracted in float64 and then rounded to the dtype of the points; differentiable in both.
 

@@ -2,10 +2,8 @@
 
 import torch
 
-from gsx.core.rasterizer.batch import rasterize_batch
-from gsx.core.rasterizer.fixed_lists import FixedLists, ListSizes, Needed
-from gsx.core.rasterizer.projection import checked_lens, dilations_of, drawable, repeat_rows, take_rows
-from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize, rasterize_fixed
+from gsx.core.rasterizer.projection import drawable, repeat_rows, take_rows
+from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.rasterizer.tiled import TILE_PIXELS, TiledRendering, rasterize_tiled
 from gsx.core.rasterizer.visibility import touches, undilated_radii
@@ -13,20 +11,13 @@ from gsx.engine.path import goes_compiled
 
 __all__ = [
     "TILE_PIXELS",
-    "FixedLists",
-    "ListSizes",
-    "Needed",
     "RasterSettings",
     "Rendering",
     "ScreenStatistics",
     "TiledRendering",
-    "checked_lens",
-    "dilations_of",
     "drawable",
     "goes_compiled",
     "rasterize",
-    "rasterize_batch",
-    "rasterize_fixed",
     "rasterize_tiled",
     "repeat_rows",
     "take_rows",

@@ -16,7 +16,6 @@ from gsx.core.device import uploaded
 from gsx.core.errors import TooManyPairs
 from gsx.core.rasterizer.bags import bag_sums, edges_of
 from gsx.core.rasterizer.boxes import boxes, compiled_boxes, compiled_spans, spans
-from gsx.core.rasterizer.fixed_lists import FixedLists, owners
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
@@ -48,9 +47,6 @@ class TileIntersections:
     """How many each of them has."""
     radii: Int[Tensor, "M"]
     """Published radius in px, ceil(3 sqrt(largest eigenvalue)); 0 where the splat touches no tile."""
-    needed: Int[Tensor, "2"] | None = None
-    """Rows of tiles and pairs that would be needed, where lists have fixed sizes: then behind the pairs are some of
-    padding, of the tile and splat that are one past the last."""
 
 
 def reach_of(settings: RasterSettings) -> float:
@@ -88,7 +84,7 @@ def uploaded_numbers(frame: Frame, size: tuple[int, int], grid: TileGrid, device
 
 
 @torch.no_grad()
-def boxes_of(screen: ScreenSplats, camera: Camera, settings: RasterSettings, fixed: FixedLists | None = None) -> Boxes:
+def boxes_of(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> Boxes:
     """Boxes of splats on the screen."""
     rules = (
         settings.alpha_min,
@@ -96,7 +92,7 @@ def boxes_of(screen: ScreenSplats, camera: Camera, settings: RasterSettings, fix
         reach_of(settings),
         settings.cull == "published" and settings.pixel == "sample",
     )
-    numbers = fixed.raster if fixed else raster_numbers(camera, settings, screen.means.device)
+    numbers = raster_numbers(camera, settings, screen.means.device)
     given = screen.means.detach(), screen.covariances.detach(), screen.log_opacities.detach(), numbers
     compiled = len(screen.ids) > 1 and compiles(settings, screen.means.device.type)
     *edges, radii, limits = compiled_boxes(*rules)(*given) if compiled else boxes(*given, *rules)
@@ -104,42 +100,26 @@ def boxes_of(screen: ScreenSplats, camera: Camera, settings: RasterSettings, fix
 
 
 @torch.no_grad()
-def intersect_tiles(
-    screen: ScreenSplats, camera: Camera, settings: RasterSettings, fixed: FixedLists | None = None
-) -> TileIntersections:
+def intersect_tiles(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> TileIntersections:
     """Of every splat with every tile where its alpha may reach alpha_min.
 
     Raises:
         TooManyPairs: more than `settings.max_pairs` pairs would be needed.
     """
-    grid, found = TileGrid.of(camera, settings.tile_size), boxes_of(screen, camera, settings, fixed)
+    grid, found = TileGrid.of(camera, settings.tile_size), boxes_of(screen, camera, settings)
     # positive floats sort like the integers of their bits, which torch sorts faster; ties stay in their order
     bits = screen.depths.contiguous().view({4: torch.int32, 8: torch.int64}[screen.depths.element_size()])
     order = sorted_stably(bits)[1]
     shapes = screen.means.detach(), screen.conic_factors.detach(), found.limits
     heights, placed, sides = in_order(order, found.first, found.last, *shapes)
     starts = heights.cumsum(0) - heights  # apart: compiled, a long running sum is one of a single group of threads
-    size = fixed.rows if fixed else refuse_too_many(heights, grid, settings)
-    rank = owners(heights, size, fixed is not None)
+    rank = torch.repeat_interleave(heights, output_size=refuse_too_many(heights, grid, settings))
     given = rank, placed, sides, starts
     compiled = min(len(rank), len(order)) > 1 and compiles(settings, rank.device.type)
     rules = grid.tile, reach_of(settings)
     row, begin, widths = compiled_spans(*rules)(*given) if compiled else spans(*given, *rules)
-    radii, needed = found.radii, None
-    if fixed:
-        widths, needed = counted_in_lists(widths, heights)
-    line = owners(widths, fixed.pairs if fixed else refuse_too_many(widths, grid, settings), fixed is not None)
-    if screen.shown is not None:
-        radii = torch.where(screen.shown, radii, 0)
-    return sorted_pairs(order, rank, row - grid.first[1], begin - grid.first[0], widths, line, grid, radii, needed)
-
-
-@fused
-def counted_in_lists(widths: Int[Tensor, "R"], heights: Int[Tensor, "M"]) -> tuple[Int[Tensor, "R"], Int[Tensor, "2"]]:
-    """(widths of the rows of tiles that there are, 0 for those behind them; how many rows there are, and pairs)."""
-    rows = heights.sum()
-    widths = torch.where(torch.arange(widths.shape[0], device=widths.device) < rows, widths, 0)
-    return widths, torch.stack([rows, widths.sum()])
+    line = torch.repeat_interleave(widths, output_size=refuse_too_many(widths, grid, settings))
+    return sorted_pairs(order, rank, row - grid.first[1], begin - grid.first[0], widths, line, grid, found.radii)
 
 
 @fused
@@ -178,22 +158,16 @@ def sorted_pairs(
     line: Int[Tensor, "P"],
     grid: TileGrid,
     radii: Int[Tensor, "M"],
-    needed: Int[Tensor, "2"] | None,
 ) -> TileIntersections:
     """Expand spans of `widths` tiles from column `begin` of a tile row into intersections, and sort them by tile.
 
-    `rank` names the splat of each span, `line` the span of each intersection; `needed` is given where some of these are
-    padding.
+    `rank` names the splat of each span, `line` the span of each intersection.
     """
     columns, rows = grid.shape
     narrow = torch.int16 if columns * rows <= torch.iinfo(torch.int16).max else torch.int32  # sorted fastest
     tiles = pair_tiles(line, row, begin, widths.cumsum(0, dtype=torch.int32) - widths, columns)
-    if needed is not None:
-        tiles = torch.where(torch.arange(len(tiles), device=tiles.device) < needed[1], tiles, columns * rows)
     tiles, slots = sorted_stably(tiles.to(narrow))
     splats = order.int().index_select(0, rank).index_select(0, line).index_select(0, slots)
-    if needed is not None:
-        splats = torch.where(tiles < columns * rows, splats, len(order))
     counts = widths.new_zeros(len(order)).index_add_(0, rank, widths)
     edges = torch.arange(columns * rows + 1, device=tiles.device, dtype=torch.int32)
     return TileIntersections(
@@ -204,7 +178,6 @@ def sorted_pairs(
         order=order,
         counts=counts,
         radii=radii,
-        needed=needed,
     )
 
 
@@ -213,7 +186,7 @@ def sum_by_splat(
 ) -> Float[Tensor, "count V"]:
     """Sums over the entries of each splat, always in the same order; `places`: entry of each pair, pairs sorted by
     splat."""
-    sums = bag_sums(values, places, edges_of(intersections.counts), spare=intersections.needed is not None)
+    sums = bag_sums(values, places, edges_of(intersections.counts))
     return values.new_zeros(count, values.shape[1]).index_copy_(0, intersections.order, sums)
 
 

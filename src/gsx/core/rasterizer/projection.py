@@ -16,15 +16,13 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.bags import runs_added
 from gsx.core.rasterizer.geometry import geometry
 from gsx.core.rasterizer.selection import chosen_rows, lens_of, selected, slope_bounds
-from gsx.core.rasterizer.settings import NOTHING, RasterSettings
+from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
 from gsx.engine.compiling import IN_VECTORS, compile_rows
 from gsx.engine.path import compiles, goes_compiled
 
 FOCAL_LIMIT = 1e12
 """No camera has a focal length of so many px, or sees so many focal lengths off its axis."""
-ELSEWHERE = (1.0, 1.0, 1.0, NOTHING, 0.0)
-"""Point, scales, quaternion, ln opacity and colours of what is not shown, where it is projected all the same."""
 Geometry: TypeAlias = Callable[..., tuple[Tensor, Tensor, Tensor, Tensor | None]]
 """`geometry`, compiled or not."""
 
@@ -45,10 +43,8 @@ class ScreenSplats:
     log_opacities: Float[Tensor, "M"]
     """Compensated for dilation where the settings ask for it."""
     channels: Float[Tensor, "M C"]
-    dropped: int | Int[Tensor, ""]
+    dropped: int
     """Splats left out because a value or a projection of theirs is not finite, or its square is not."""
-    shown: Bool[Tensor, "M"] | None = None
-    """Those that the camera may show, where all splats are here: the others draw nothing. None: all of these."""
 
 
 def intrinsics_of(camera: Camera, intrinsics: Float[Tensor, "4"] | None) -> Float[Tensor, "4"]:
@@ -93,36 +89,26 @@ def drawable(splats: Splats, camera: Camera, settings: RasterSettings) -> Bool[T
 
 
 def project(
-    splats: Splats,
-    camera: Camera,
-    settings: RasterSettings,
-    intrinsics: Float[Tensor, "4"] | None = None,
-    lens: Float[Tensor, "16"] | None = None,
+    splats: Splats, camera: Camera, settings: RasterSettings, intrinsics: Float[Tensor, "4"] | None = None
 ) -> ScreenSplats:
     """The usable splats in front of the near plane that the camera may show; differentiable in every input.
 
-    `intrinsics` (fx, fy, cx, cy) take the place of the camera's own, in px of its raster. With `lens`, on the device
-    and checked, the host need not hear how many there are: all splats are projected, those not shown from elsewhere.
+    `intrinsics` (fx, fy, cx, cy) take the place of the camera's, in px of its raster.
 
     Raises:
         InputError: no picture can be taken with the camera's numbers.
     """
-    numbers = uploaded(checked_lens(camera, settings, intrinsics), splats.means.device) if lens is None else lens
+    own = intrinsics_of(camera, intrinsics)
+    refuse_unusable(camera, own, settings.jacobian_margin)
     dilation, drawn = dilations_of(camera, intrinsics, settings)
+    lens = lens_of(camera, on_frame(own, camera.frame), dilation, settings)
+    numbers = uploaded(lens, splats.means.device)
     points = camera.to_camera(splats.means)
     compiled = len(splats) > 1 and compiles(settings, splats.means.device.type)
     good, shown = selected(splats, points, numbers, compiled)
-    given = (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
-    dropped: int | Tensor
-    if lens is None:
-        ids, dropped = chosen_rows(good, shown)  # before any division
-        points, scales, quats, log_opacities, channels = (take_rows(values, ids) for values in given)
-    else:
-        ids, dropped = torch.arange(len(splats), device=shown.device), (~good).sum()
-        points, scales, quats, log_opacities, channels = (
-            torch.where(shown.view(-1, *[1] * (values.dim() - 1)), values, elsewhere)
-            for values, elsewhere in zip(given, ELSEWHERE, strict=True)
-        )
+    fields = (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
+    ids, dropped = chosen_rows(good, shown)  # before any division
+    points, scales, quats, log_opacities, channels = (take_rows(values, ids) for values in fields)
     compensate = settings.compensate and settings.published_dilation
     # tensors of one element: a number would be a constant, so that each dilation would compile anew, and so would, to
     # torch, a float64 tensor of no dimension
@@ -146,22 +132,7 @@ def project(
         log_opacities=log_opacities if compensation is None else log_opacities + compensation,
         channels=channels,
         dropped=dropped,
-        shown=None if lens is None else shown,
     )
-
-
-def checked_lens(
-    camera: Camera, settings: RasterSettings, intrinsics: Float[Tensor, "4"] | None = None
-) -> Float[Tensor, "16"]:
-    """The numbers of a camera's `Lens`, where `intrinsics` may take the place of its own; differentiable in them.
-
-    Raises:
-        InputError: no picture can be taken with the camera's numbers.
-    """
-    own = intrinsics_of(camera, intrinsics)
-    refuse_unusable(camera, own, settings.jacobian_margin)
-    dilation, _ = dilations_of(camera, intrinsics, settings)
-    return lens_of(camera, on_frame(own, camera.frame), dilation, settings)
 
 
 def dilations_of(

@@ -9,7 +9,6 @@ from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.cap import capped
 from gsx.core.rasterizer.composite import composite, make_blocks
-from gsx.core.rasterizer.fixed_lists import FixedLists
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import TileIntersections, intersect_tiles
 from gsx.core.rasterizer.projection import ScreenSplats, project
@@ -77,8 +76,6 @@ class Rendering:
     """Splat-tile pairs blended."""
     dropped: int
     """Splats left out because a value of theirs is not finite."""
-    needed: Int[Tensor, "5"] | None = None
-    """The numbers of `Needed`, where lists have fixed sizes: then `intersections` is room, and `dropped` unknown."""
 
 
 def blend(
@@ -100,7 +97,7 @@ def blend(
             screen, inputs[0], channels, intersections, grid, settings, absgrad=absgrad, max_weight=max_weight
         )
     if takes(settings, channels.shape[1], len(intersections.splats), max_weight, screen.means.device.type):
-        return composite_compiled(*inputs, intersections, grid, settings, absgrad=absgrad)[0], None
+        return composite_compiled(*inputs, intersections, grid, settings, absgrad=absgrad), None
     blocks = make_blocks(intersections, settings.chunk, len(screen.ids))
     by_entry = screen.means.new_zeros(blocks.splats.shape) if max_weight else None
     blended = composite(*inputs, blocks, grid, settings, absgrad=absgrad, max_weights=by_entry)
@@ -145,40 +142,6 @@ def rasterize(
         alpha=alpha,
         depth=blended[count] if depth else None,
         intersections=len(intersections.splats),
-        dropped=int(screen.dropped),
+        dropped=screen.dropped,
         screen=replace(told, max_weights=max_weights),
-    )
-
-
-def rasterize_fixed(
-    splats: Splats,
-    camera: Camera,
-    settings: RasterSettings,
-    fixed: FixedLists,
-    *,
-    background: Float[Tensor, "C"],
-    absolute_gradient: bool = False,
-) -> Rendering:
-    """What `rasterize` draws by the segment schedule, and the host waits for nothing; right if `fixed` holds what is
-    needed.
-
-    The camera's pose lies where the splats do. No cap on lists, and pixels are samples.
-    """
-    screen = project(splats, camera, settings, lens=fixed.lens)
-    intersections = intersect_tiles(screen, camera, settings, fixed)
-    told = ScreenStatistics.before_blending(screen, intersections.radii, camera.size, True, absolute_gradient)
-    inputs = (screen.means + told.means2d_offset, screen.conic_factors, screen.log_opacities, screen.channels)
-    grid = TileGrid.of(camera, settings.tile_size)
-    blended, blocks = composite_compiled(*inputs, intersections, grid, settings, absgrad=told.absgrad, fixed=fixed)
-    assert intersections.needed is not None
-    assert blocks is not None
-    dropped = torch.as_tensor(screen.dropped)[None]
-    return Rendering(
-        image=blended[:-1] + (1 - blended[-1]) * background.to(blended)[:, None, None],
-        alpha=blended[-1],
-        depth=None,
-        intersections=fixed.pairs,
-        dropped=0,
-        needed=torch.cat([dropped, intersections.needed, blocks]),
-        screen=told,
     )

@@ -12,7 +12,6 @@ import torch
 from gsx.core.errors import Disagreement, LostModel, TrainingError, command
 from gsx.core.plugins import hookimpl
 from gsx.core.training.parameter_table import gradients, table_tensors
-from gsx.core.training.recorded import loss_and_sums, told_of
 from gsx.core.training.run import Run, StepResult
 
 logger = logging.getLogger(__name__)
@@ -62,13 +61,14 @@ class Guard:
 
 
 def culprit(run: Run, step: StepResult) -> str | None:
-    """What is not finite: the loss, or a parameter's gradient with the number of rows concerned."""
-    found = gradients(run.backbone.table)
-    loss, sums = step.told or told_of(loss_and_sums(step.loss, found).tolist(), found)
+    """Names what is not finite: the loss, or a parameter's gradient with the number of rows concerned."""
+    by_name = gradients(run.backbone.table)
+    # one read of the device: the loss, then the sum of every gradient
+    loss, *sums = torch.stack([step.loss, *(gradient.sum() for gradient in by_name.values())]).tolist()
     if not math.isfinite(loss):
         return f"the loss is {loss}"
-    for name, gradient in found.items():
-        if not math.isfinite(sums[name]):
+    for (name, gradient), total in zip(by_name.items(), sums, strict=True):
+        if not math.isfinite(total):
             rows = int((~torch.isfinite(gradient)).reshape(len(gradient), -1).any(1).sum())
             if rows == 0:  # every value is finite, only their sum overflowed
                 continue

@@ -21,7 +21,6 @@ from gsx.core.training.backbone import Backbone, Observation, Settling
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.pseudo_views import Term
-from gsx.core.training.recorded import Recorder, Told
 from gsx.core.training.training_views import TrainingViews
 from gsx.modules.blur import Blur, BlurOptions
 from gsx.modules.distractors import DistractorOptions, Distractors
@@ -40,8 +39,6 @@ class TrainingOptions:
     checkpoint_every: Interval = without_effect()
     checkpoints_kept: Interval = without_effect()
     test_points: Annotated[int, Range(0, 10**6)] = without_effect()
-    cuda_graphs: bool = without_effect(default=False)
-    """On a GPU steps are recorded and replayed where they can be (`core.training.recorded`), with the same results."""
     batch: Annotated[int, Range(1, 10**6)] = 1
     """Views per step, whose mean loss it lowers. The default: runs older than this option."""
     supersample: Annotated[int, Range(1, 16)] = 1
@@ -184,8 +181,6 @@ class Run:
     """Lines of metrics.jsonl so far."""
     photograph_bytes: int = 0
     """How many bytes photographs may take on the device (`core.training.photographs`)."""
-    recorder: Recorder | None = None
-    """Takes steps that can be recorded; None: all are launched one by one."""
     photographs: Photographs = field(init=False)
     plateau: Plateau = field(init=False)
 
@@ -250,8 +245,7 @@ class Run:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepResult:
-    """One training step, after its backward pass. Of a batch `view`, `target` and `rendering` are this rank's first.
-    Screen statistics of a recorded step last until the next step."""
+    """One training step, after its backward pass. Of a batch `view`, `target` and `rendering` are this rank's first."""
 
     number: int
     view: View
@@ -273,8 +267,6 @@ class StepResult:
     """Parts of the loss by name, as they enter it, where there is more than the backbone's own; mean over the batch."""
     pseudo: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Accounts of the pictures requested at this step, by augmenter (`Accounting`); mostly none."""
-    told: Told | None = None
-    """What the host has heard of loss and gradients already; None: nothing."""
     skipped: str = ""
     """Why nothing was updated; empty for an ordinary step."""
 

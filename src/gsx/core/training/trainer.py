@@ -23,10 +23,8 @@ from gsx.core.training.forward import observe, render_for_training
 from gsx.core.training.importance import Probe
 from gsx.core.training.minibatch import gradients_added, merge_gradients, rollback_on_error
 from gsx.core.training.parameter_table import zero_grad
-from gsx.core.training.photographs import numbers_of
 from gsx.core.training.pseudo_terms import backward_terms, request_terms, reusable_parts, reused_losses, without_windows
 from gsx.core.training.pseudo_views import Term
-from gsx.core.training.recorded import ToLearn
 from gsx.core.training.run import Run, StepResult
 from gsx.engine.compile_cache import waiting_counted
 from gsx.engine.threads import relieve_oversubscription
@@ -48,8 +46,6 @@ def train(run: Run, plugins: Plugins) -> None:
             break
         run.seconds += time.perf_counter() - begun - waited.seconds
         plugins.emit.gsx_step_finished(run=run, step=step)
-    if run.recorder is not None:
-        run.recorder.forget()
     run.photographs.see(())
     plugins.emit.gsx_training_finished(run=run)
 
@@ -149,10 +145,6 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     """
     windows, seen = withheld_windows(run, view, number), list[Observation]()
     counted = counted_in_loss(view, windows)
-    if counted is None and not terms and may_be_recorded(run, number, view):
-        step = recorded_step(run, number, view, colour)
-        if step is not None:
-            return step
     target = blacked(run.photographs.of(view), counted)
     allowed = [without_windows(term, view.camera, windows) for term in terms]
     divided = [reusable_parts(term, view.camera, run.training.random_background) for term in allowed]
@@ -185,40 +177,6 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
         terms=named,
         seen=seen,
         dropped=rendering.dropped,
-    )
-
-
-def may_be_recorded(run: Run, number: int, view: View) -> bool:
-    """Whether a view, if without pseudo views and masks, is learnt by recorded work at a step."""
-    if run.recorder is None or run.recorder.alike(number) is None:
-        return False
-    alone = run.training.batch == 1 and run.ranks.size == 1
-    plain = run.exposures.matrices is None and view.name not in run.blur.movements
-    return alone and plain and run.views.supersample_at(number) == 1
-
-
-def recorded_step(run: Run, number: int, view: View, colour: Float[Tensor, "3"]) -> StepResult | None:
-    """The step of a view, by recorded work; None where this one cannot be recorded.
-
-    Raises:
-        InputError: no picture can be taken with the camera's numbers.
-    """
-    assert run.recorder is not None
-    photograph = run.photographs.bytes_of(view)
-    learnt = run.recorder.learn(
-        ToLearn(camera=view.camera, photograph=photograph, background=colour, raster=run.raster, step=number)
-    )
-    if learnt is None:
-        return None
-    return StepResult(
-        number=number,
-        view=view,
-        target=numbers_of(photograph),
-        rendering=learnt.rendering,
-        loss=learnt.loss,
-        told=learnt.told,
-        seen=[observe(run, learnt.drawn, learnt.rendering, number, 1.0)],
-        dropped=learnt.rendering.dropped,
     )
 
 

@@ -22,6 +22,7 @@ RENAMED = {
 """New dotted keys by old ones."""
 REMOVED: dict[str, Any] = {
     "trunk_gb": None,
+    "training.cuda_graphs": None,
 }
 """Keys without a successor, each with the value by which gsx still trains; None: the key changed no result."""
 

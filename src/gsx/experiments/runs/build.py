@@ -19,13 +19,11 @@ from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
 from gsx.core.training.distributed import Ranks, ranks_here
 from gsx.core.training.photographs import room_for_photographs
-from gsx.core.training.recorded import Recorder
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.training_views import TrainingViews
 from gsx.engine.allocator import keep_freed_memory
 from gsx.engine.cache import MANIFEST, cache_folder, content_key, make_folder
-from gsx.engine.compiled import path_of
 from gsx.engine.machine import processor_kind
 from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.halves import Anew, held_out_renders
@@ -182,7 +180,6 @@ def build(
         generator=generator,
         sampler=Sampler(len(scene.train), general.seed, batch=settings.training.batch),
         photograph_bytes=room_for_photographs(device) if training else 0,
-        recorder=recorder_of(backbone, settings.training, device) if training else None,
         augmenters=build_augmenters(settings, scene, anew) if training else {},
         ranks=ranks,
     )
@@ -211,18 +208,6 @@ def backbone_of(
         begins=begins,
     )
     return chosen.component.factory(chosen.options, context)
-
-
-def recorder_of(backbone: Backbone, training: TrainingOptions, device: torch.device) -> Recorder | None:
-    """What records the steps of a run; None where that is not asked for, or cannot be done, which is said."""
-    if not training.cuda_graphs or device.type != "cuda":
-        return None
-    raster = backbone.raster
-    plain = raster.schedule != "chunks" and raster.pixel == "sample" and raster.tile_cap == 0
-    if plain and path_of(raster, device) == "compiled":
-        return Recorder(backbone=backbone, ssim_weight=training.ssim_weight)
-    logger.warning("training.cuda_graphs: steps are not recorded, since pictures are not blended by compiled segments")
-    return None
 
 
 def build_augmenters(settings: Settings, scene: Scene, anew: Anew) -> dict[str, Augmenter]:

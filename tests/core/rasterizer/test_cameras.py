@@ -1,14 +1,14 @@
-"""Gradients of pose and intrinsics against finite differences, and several cameras at once."""
+"""Gradients of pose and intrinsics against finite differences."""
 
 from dataclasses import replace
 
 import pytest
 import torch
-from raster_scenes import SMOOTH, changed, front_camera, gradients, leaves, random_splats, soft_splats
+from raster_scenes import SMOOTH, changed, front_camera, random_splats, soft_splats
 
 from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
-from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_batch
+from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.reference import render_reference
 
 
@@ -109,55 +109,3 @@ def test_float32_pose_and_intrinsics_get_gradients_through_float32_splats() -> N
 
     for narrow, wide in zip(found(torch.float32), found(torch.float64), strict=True):
         assert (narrow - wide).norm() <= 1e-4 * wide.norm()
-
-
-# -- batches -------------------------------------------------------------------------------------------------------
-
-
-def views() -> list[Camera]:
-    return [front_camera(), front_camera(33, 21), front_camera().crop(-5, 9, 40, 40)]
-
-
-def test_a_batch_is_its_cameras_one_by_one() -> None:
-    splats, rules = random_splats(), RasterSettings()
-    colours = torch.rand(3, 3, generator=torch.Generator().manual_seed(4))
-    together = rasterize_batch(splats, views(), rules, background=colours, depth=True)
-    for camera, colour, rendering in zip(views(), colours, together, strict=True):
-        alone = rasterize(splats, camera, rules, background=colour, depth=True)
-        assert torch.equal(rendering.image, alone.image)
-        assert torch.equal(rendering.depth, alone.depth)
-        assert rendering.screen.size == camera.size
-
-
-def test_gradients_add_up_over_a_batch() -> None:
-    rules, colour = RasterSettings(), torch.tensor([0.1, 0.2, 0.3])
-    lenses = torch.stack([intrinsics_of(camera) for camera in views()])
-
-    together, shared = leaves(random_splats()), lenses.clone().requires_grad_()
-    batch = rasterize_batch(together, views(), rules, background=colour, intrinsics=shared)
-    torch.stack([rendering.image.square().mean() for rendering in batch]).sum().backward()
-    one_by_one, each = leaves(random_splats()), lenses.clone().requires_grad_()
-    for camera, lens in zip(views(), each.unbind(), strict=True):
-        rasterize(one_by_one, camera, rules, background=colour, intrinsics=lens).image.square().mean().backward()
-
-    for name, value in gradients(one_by_one).items():
-        assert torch.allclose(getattr(together, name).grad, value, rtol=1e-5, atol=1e-9), name
-    assert torch.allclose(shared.grad, each.grad)
-    # each rendering keeps the statistics of its own camera
-    norms = [float(rendering.screen.means2d_offset.grad.norm()) for rendering in batch]
-    assert len(set(norms)) == 3
-    assert min(norms) > 0
-
-
-def test_an_empty_batch_has_no_renderings() -> None:
-    assert rasterize_batch(random_splats(), [], RasterSettings()) == []
-
-
-def test_a_batch_names_what_does_not_fit() -> None:
-    with pytest.raises(InputError, match="2 backgrounds for 3 cameras"):
-        rasterize_batch(random_splats(), views(), RasterSettings(), background=torch.zeros(2, 3))
-    with pytest.raises(InputError, match="1 rows of intrinsics for 3 cameras"):
-        rasterize_batch(random_splats(), views(), RasterSettings(), intrinsics=torch.ones(1, 4))
-    broken = [*views(), replace(front_camera(), fx=0.0)]
-    with pytest.raises(InputError, match=r"camera 3 of 4: .*fx=0\.0"):
-        rasterize_batch(random_splats(), broken, RasterSettings())
