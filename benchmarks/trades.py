@@ -1,13 +1,16 @@
-"""What a training costs and brings by its settings, on several scenes: `gsx trade training`, and docs/trade-offs.md.
+"""What settings cost and bring: of a training on several scenes, and of the rasterizer (docs/trade-offs.md).
 
     python benchmarks/trades.py [--scenes FOLDER] [--only demo,fox,lego] [--seeds 0,1] [--jobs 2]
+    python benchmarks/trades.py --what rasterizer [--run RUN] [rasterizer.KEY=VALUE ...]
 
 FOLDER holds `fox` (COLMAP) and `lego` (NeRF-Synthetic). Runs that are finished below --runs are not trained again.
 `--page-only` writes the page anew from the committed figures. Half an hour of a core for a scene and a seed.
+`rasterizer` changes one setting of the rasterizer at a time, on test views of a run, else on random splats.
 """
 
 import argparse
 import statistics
+import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,16 +19,49 @@ from typing import Any
 
 import torch
 
-from capacity import ADAPTIVE, RESULTS, SUBJECTS, ZOOMS, scenes_of
-from gsx.core.files import read_json, replace_text
+from capacity import ADAPTIVE, SUBJECTS, ZOOMS, scenes_of
+from gsx.core.files import replace_text
 from gsx.experiments.reports.charts import pareto_front
+from gsx.experiments.runs.build import choose_device
+from measuring.adapter import missing, settings_of
+from measuring.knobs import COLUMNS as KNOB_COLUMNS
+from measuring.knobs import NOTE as KNOB_NOTE
+from measuring.knobs import knob_rows, shots_of
 from measuring.machine import describe_machine, shown_command, told_load
-from measuring.results import Section, cell, read_sections, stamped, write_results
-from measuring.runs import gsx
-from zoom import numbers, told
+from measuring.results import Section, cell, read_sections, stamped, text_table, write_results
+from measuring.runs import train
+from measuring.watches import Patience
+from zoom import shared_arguments, steps_among, told
 
 PAGE = Path(__file__).parents[1] / "docs" / "trade-offs.md"
 TITLES = {"demo": "The built-in scene", "fox": "fox, an eighth", "lego": "lego, a quarter"}
+HALF, TWICE = "half the steps", "twice the steps"
+TRADES: dict[str, dict[str, tuple[str, ...]]] = {
+    "primitives": {
+        "published growth": ("backbone.capacity=published",),
+        "adaptive, price 0.3": ("backbone.adaptive.price=0.3",),
+        "adaptive, price 2": ("backbone.adaptive.price=2",),
+    },
+    "steps": {
+        HALF: (),
+        "faster rates": ("backbone.rates.shortened=0.4",),
+        "cooled down": ("training.cooldown=0.2",),
+    },
+    "resolution": {
+        "coarse to fine": ("training.coarse=2", "training.coarse_until=0.3"),
+        "supersampled at last": ("training.supersample=2", "training.supersample_from=0.8"),
+    },
+    "filter": {"mip": ("backbone.filter=mip",)},
+    "colour": {"SH degree 1": ("backbone.sh_degree=1",)},
+    "bands": {"SH bands judged": ("backbone.sh_judged=0.8", "backbone.sh_price=0.2")},
+    "levels": {"octree": ("backbone=octree_gs3d",)},
+    "more steps": {TWICE: ()},
+    "pseudo details": {"upscaled by Lanczos": ("augmenter=[upscale]", "regenerator/upscale=lanczos")},
+}
+"""What each setting adds to the composition, by what is traded."""
+LENGTHS = {HALF: 0.5, TWICE: 2.0}
+"""Times the steps of the composition."""
+GIVEN = "as given"
 COLUMNS = [
     *(["setting", "setting"], ["overrides", "overrides"]),
     *(column for f in ZOOMS for column in ([f"x{f}", f"x{f}"], [f"more{f}", f"x{f} - as given"])),
@@ -38,92 +74,142 @@ NOTE = (
     "PSNR on held-out views, dB, means over seeds ± half their range; differences seed by seed, times are those of the "
     "last seed. MB of the standard splat file. Best: nothing else is at least as good at x4 for no more."
 )
+Evaluation = Mapping[str, Any]
 
 
 def arguments(words: Sequence[str]) -> argparse.Namespace:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=Path, default=None, help="the folder with the captures")
-    parser.add_argument("--only", default=",".join(TITLES), help="scenes, by commas")
-    parser.add_argument("--seeds", type=numbers, default=[0, 1], help="by commas (0,1)")
-    parser.add_argument("--trades", default="", help="of conf/trade, by commas (all)")
-    parser.add_argument("--combinations", type=int, default=1, help="of good settings, at most (1)")
-    parser.add_argument("--jobs", type=int, default=1, help="commands at a time")
-    parser.add_argument("--runs", type=Path, default=Path("outputs/trades"), help="where the runs are kept")
-    parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the tables")
+    parser = shared_arguments(__doc__, ",".join(TITLES), "outputs/trades")
+    parser.set_defaults(seeds=[0, 1])
+    parser.add_argument("--what", default="training", choices=("training", "rasterizer"), help="what is traded")
+    parser.add_argument("--trades", default=",".join(TRADES), help="of a training, by commas (all)")
+    parser.add_argument("--run", type=Path, help="rasterizer: run folder (random splats)")
+    parser.add_argument("--paths", default="eager,compiled", help="rasterizer: by commas (both, where they work)")
+    parser.add_argument("--device", default="cpu", help="rasterizer: cpu or cuda (cpu)")
+    parser.add_argument("--views", type=int, default=2, help="rasterizer: test views of the run (2)")
+    parser.add_argument("--repeats", type=int, default=7, help="rasterizer: rounds of timing (7)")
+    parser.add_argument("--quick", action="store_true", help="rasterizer: tiny sizes, to see that everything works")
     parser.add_argument("--page", type=Path, default=PAGE, help="the page to write")
     parser.add_argument("--page-only", action="store_true", help="measure nothing")
-    return parser.parse_args(words)
+    parser.add_argument("overrides", nargs="*", help="rasterizer: base settings, rasterizer.KEY=VALUE")
+    given = parser.parse_intermixed_args(words)
+    for trade in given.trades.split(","):
+        if trade not in TRADES:
+            parser.error(f"'{trade}' is no trade: choose from {', '.join(TRADES)}")
+    return given
 
 
-def words_of(scene: str, seeds: Sequence[int], combinations: int, given: argparse.Namespace) -> list[str]:
-    """The command for a scene."""
+# -- the rasterizer --------------------------------------------------------------------------------------------------
+
+
+def trade_rasterizer(given: argparse.Namespace, command: str) -> None:
+    """Measure every setting of the rasterizer, print and write the table."""
+    device, load = choose_device(given.device), told_load()
+    path = [] if any(word.startswith("rasterizer.path=") for word in given.overrides) else ["rasterizer.path=eager"]
+    base = settings_of("auto", *path, *given.overrides)
+    shots, name = shots_of(given.run, given.views, given.quick, device)
+    paths = [path for path in given.paths.split(",") if not missing(path, device)]
+    rows = knob_rows(shots, base, paths, Patience(2 if given.quick else given.repeats, 600))
+    section = stamped("Settings of the rasterizer", KNOB_COLUMNS, rows, [f"{name}. {KNOB_NOTE}"], load, command)
+    result = f"trades_rasterizer_{device.type}{'_quick' if given.quick else ''}"
+    write_results(given.to, result, describe_machine(device), {"settings": section})
+    sys.stdout.write(text_table(section))
+
+
+# -- training --------------------------------------------------------------------------------------------------------
+
+
+def settings_of_trades(trades: str, iterations: int) -> dict[str, list[str]]:
+    """Overrides by the name of a setting; the composition as given comes first."""
+    out: dict[str, list[str]] = {GIVEN: []}
+    for trade in trades.split(","):
+        for name, words in TRADES[trade].items():
+            length = [f"iterations={round(LENGTHS[name] * iterations)}"] if name in LENGTHS else []
+            out[name] = [*words, *length]
+    return out
+
+
+def trained(scene: str, name: str, words: Sequence[str], given: argparse.Namespace) -> list[Evaluation]:
+    """Evaluations of a setting by seed; none where the setting does not suit the scene."""
     where = [] if scene == "demo" else [f"scene.path={given.scenes / scene}"]
-    trades = ["--trades", given.trades] if given.trades else []
-    asked = ["--seeds", ",".join(map(str, seeds)), "--combinations", str(combinations), *trades]
-    zooms = f"eval.zoom=[{','.join(ZOOMS)}]"
-    return ["trade", "training", "backbone=gs3d", ADAPTIVE, *SUBJECTS[scene], *where, zooms, *asked]
-
-
-def tried(scene: str, seeds: Sequence[int], combinations: int, given: argparse.Namespace) -> dict[str, Any]:
-    """trade.json of a scene with these seeds; runs of all seeds lie in one folder."""
-    folder, name = given.runs / scene, "_".join([scene, *map(str, seeds)])
-    folder.mkdir(parents=True, exist_ok=True)
     threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
-    words = words_of(scene, seeds, combinations, given)
-    gsx([*words, "--to", str(folder)], threads, given.runs / f"{name}.log")
-    return read_json(folder / "trade.json")
+    out = []
+    for seed in given.seeds:
+        folder = given.runs / scene / f"{name.replace(',', '').replace(' ', '_')}_{seed}"
+        zooms = f"eval.zoom=[{','.join(ZOOMS)}]"
+        composition = ["backbone=gs3d", ADAPTIVE, *SUBJECTS[scene], *where, zooms, f"seed={seed}", *words]
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            out.append(train(folder, composition, threads, folder.with_name(f"{folder.name}.log")))
+        except subprocess.CalledProcessError:
+            if name == GIVEN:
+                raise
+            print(f"{scene}: '{name}' cannot be trained, see {folder.name}.log", file=sys.stderr)
+            return []
+    return out
 
 
-def measured(given: argparse.Namespace) -> dict[str, dict[str, Any]]:
-    """trade.json by scene: first the settings with every seed, each on its own, then all together with combinations."""
-    scenes = scenes_of(given)
+def measured(given: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
+    """Rows by scene."""
+    listed = {scene: settings_of_trades(given.trades, steps_among(SUBJECTS[scene])) for scene in scenes_of(given)}
     with ThreadPoolExecutor(given.jobs) as pool:
-        for done in [pool.submit(tried, scene, [seed], 0, given) for seed in given.seeds for scene in scenes]:
-            done.result()
-        whole = {scene: pool.submit(tried, scene, given.seeds, given.combinations, given) for scene in scenes}
-        return {scene: found.result() for scene, found in whole.items()}
+        jobs = {
+            scene: {name: pool.submit(trained, scene, name, words, given) for name, words in settings.items()}
+            for scene, settings in listed.items()
+        }
+        found = {scene: {name: job.result() for name, job in named.items()} for scene, named in jobs.items()}
+    return {scene: rows_of(found[scene], settings) for scene, settings in listed.items()}
 
 
-def row_of(row: Mapping[str, Any], first: Mapping[str, Any]) -> dict[str, Any]:
-    """A setting over seeds, beside the composition as given."""
-    runs, pairs = row["outcomes"], list(zip(row["outcomes"], first["outcomes"], strict=True))
-    shown: dict[str, Any] = {
-        "setting": row["setting"]["name"],
-        "overrides": " ".join(f"`{w}`" for w in row["overrides"]),
-    }
+def rows_of(found: Mapping[str, Sequence[Evaluation]], settings: Mapping[str, list[str]]) -> list[dict[str, Any]]:
+    """Rows of a scene, without settings that could not be trained."""
+    runs = {name: evaluations for name, evaluations in found.items() if evaluations}
+    fronts = fronts_of(list(runs.values()))
+    rows = []
+    for index, (name, own) in enumerate(runs.items()):
+        words = {"setting": name, "overrides": " ".join(f"`{word}`" for word in settings[name])}
+        front = ", ".join(unit for unit, best in fronts.items() if index in best)
+        rows.append(words | row_of(own, runs[GIVEN]) | {"front": front})
+    return rows
+
+
+def row_of(runs: Sequence[Evaluation], first: Sequence[Evaluation]) -> dict[str, Any]:
+    """Figures of a setting over seeds, and differences from the composition as given."""
+    row: dict[str, Any] = {}
     for zoom in ZOOMS:
-        shown[f"x{zoom}"] = told([run["psnr"][zoom] for run in runs], ".2f")
-        if row is not first:
-            shown[f"more{zoom}"] = told([a["psnr"][zoom] - b["psnr"][zoom] for a, b in pairs], "+.2f")
-    shown["primitives"] = round(statistics.mean(run["primitives"] for run in runs))
-    shown["megabytes"] = f"{statistics.mean(run['megabytes'] for run in runs):.1f}"
-    shown["seconds"] = round(runs[-1]["seconds"])
-    shown["times"] = f"{runs[-1]['seconds'] / first['outcomes'][-1]['seconds']:.2f}"
-    return shown
+        values, others = ([run["zoom"][zoom]["psnr"] for run in group] for group in (runs, first))
+        row[f"x{zoom}"] = told(values, ".2f")
+        if runs is not first:
+            row[f"more{zoom}"] = told([a - b for a, b in zip(values, others, strict=True)], "+.2f")
+    row["primitives"] = round(statistics.mean(run["primitives"] for run in runs))
+    row["megabytes"] = f"{statistics.mean(run['megabytes'] for run in runs):.1f}"
+    row["seconds"] = round(runs[-1]["train_seconds"])
+    row["times"] = f"{runs[-1]['train_seconds'] / first[-1]['train_seconds']:.2f}"
+    return row
 
 
-def rows_of(found: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Rows of a scene, without what does not go there."""
-    rows = [row for row in found["rows"] if row["outcomes"]]
-    fronts = fronts_of(rows)
-    return [
-        row_of(row, rows[0]) | {"front": ", ".join(unit for unit, front in fronts.items() if number in front)}
-        for number, row in enumerate(rows)
-    ]
-
-
-def fronts_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[int]]:
-    """Numbers of the rows that none beats at the finest zoom, for its time with the last seed, and for its size."""
-    gains = [statistics.mean(run["psnr"][ZOOMS[-1]] for run in row["outcomes"]) for row in rows]
+def fronts_of(settings: Sequence[Sequence[Evaluation]]) -> dict[str, list[int]]:
+    """Indices of the settings that none beats at the finest zoom, for the time of the last seed and for the size."""
+    gains = [statistics.mean(run["zoom"][ZOOMS[-1]]["psnr"] for run in runs) for runs in settings]
     costs = {
-        "time": [row["outcomes"][-1]["seconds"] for row in rows],
-        "MB": [statistics.mean(run["megabytes"] for run in row["outcomes"]) for row in rows],
+        "time": [runs[-1]["train_seconds"] for runs in settings],
+        "MB": [statistics.mean(run["megabytes"] for run in runs) for runs in settings],
     }
     return {unit: pareto_front(values, gains) for unit, values in costs.items()}
 
 
-# -- the page ----------------------------------------------------------------------------------------------------------
+def trade_training(given: argparse.Namespace, command: str) -> None:
+    """Train every setting on every scene and write the tables."""
+    machine, load = describe_machine(torch.device("cpu")), told_load()
+    machine |= {"threads": 1} if given.jobs > 1 else {}
+    notes = [f"{NOTE} Seeds: {', '.join(map(str, given.seeds))}."]
+    tables = {
+        scene: stamped(TITLES[scene], COLUMNS, rows, notes, load, command) for scene, rows in measured(given).items()
+    }
+    write_results(given.to, "trades_cpu", machine, tables)
+
+
+# -- the page --------------------------------------------------------------------------------------------------------
 
 
 def page(text: str, sections: Mapping[str, Section]) -> str:
@@ -136,7 +222,7 @@ def page(text: str, sections: Mapping[str, Section]) -> str:
 
 
 def table(section: Section) -> str:
-    """For people."""
+    """The columns that the page shows."""
     headings = dict(section["columns"])
     lines = [[cell(row.get(key)) for key in SHOWN] for row in section["rows"]]
     table = [[headings[key] for key in SHOWN], ["---"] * len(SHOWN), *lines]
@@ -145,20 +231,13 @@ def table(section: Section) -> str:
 
 def main(words: Sequence[str]) -> None:
     """Measure and write the tables and the page."""
-    given = arguments(words)
+    given, command = arguments(words), shown_command(words, "benchmarks/trades.py")
+    if given.what == "rasterizer":
+        trade_rasterizer(given, command)
+        return
     read_sections(given.to / "trades_cpu.json")  # what cannot be added to is refused before training
     if not given.page_only:
-        machine, load = describe_machine(torch.device("cpu")), told_load()
-        machine |= {"threads": 1} if given.jobs > 1 else {}
-        command, notes = (
-            shown_command(words, "benchmarks/trades.py"),
-            [f"{NOTE} Seeds: {', '.join(map(str, given.seeds))}."],
-        )
-        tables = {
-            scene: stamped(TITLES[scene], COLUMNS, rows_of(found), notes, load, command)
-            for scene, found in measured(given).items()
-        }
-        write_results(given.to, "trades_cpu", machine, tables)
+        trade_training(given, command)
     replace_text(given.page, page(given.page.read_text(), read_sections(given.to / "trades_cpu.json")))
 
 
