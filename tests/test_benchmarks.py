@@ -1,6 +1,7 @@
 """The benchmarks on tiny sizes: that they measure what they say, on yardsticks that are right themselves."""
 
 import json
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +14,11 @@ from torch import Tensor
 import rasterizer as benchmark
 import step
 from gsx.core.errors import InputError
+from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.projection import project
 from gsx.core.rasterizer.reference import render_reference
 from gsx.engine import compiled
-from measuring import naive, rival, stages
+from measuring import knobs, naive, rival, stages
 from measuring.adapter import LOOPS, blend_screen, learnable, loops_timed, settings_of
 from measuring.cases import Case, camera_of, gradient_of, pairs_of, picture, splats_of
 from measuring.limits import BACKWARD_FLOPS, FORWARD_FLOPS, Limit, backward_bytes, evaluation_limit, forward_bytes
@@ -498,22 +500,21 @@ def test_shared_cores_are_compared_within_a_round() -> None:
     assert (row["before"], row["now"], row["ratio"]) == (30.0, 10.0, "3.00 (1.25 to 4.00)")
 
 
-def test_trades_are_those_of_gsx_trade_and_the_page_is_written_from_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_trades_are_trained_and_the_page_is_written_from_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import trades
     from gsx.cli.dispatch import main
+    from measuring import runs
 
-    monkeypatch.setattr(trades, "gsx", lambda words, *rest: main(words))  # here, which spares the start of a process
+    monkeypatch.setattr(runs, "gsx", lambda words, *rest: main(words))  # here, which spares the start of a process
     monkeypatch.setitem(trades.SUBJECTS, "demo", ("scene=demo", *TINY))
     page = tmp_path / "page.md"
     page.write_text("# Above\n\n<!-- demo: written by benchmarks/trades.py -->\n| old |\n\n## Below\n")
     words = ["--only", "demo,fox", "--trades", "colour", "--runs", str(tmp_path / "runs"), "--to", str(tmp_path)]
     trades.main([*words, "--page", str(page)])
-    found = json.loads((tmp_path / "runs" / "demo" / "trade.json").read_text())
     rows = read_sections(tmp_path / "trades_cpu.json")["demo"]["rows"]
     assert [row["setting"] for row in rows] == ["as given", "SH degree 1"]
-    one, two = (run["psnr"]["1"] for run in found["rows"][1]["outcomes"])
+    folders = [tmp_path / "runs" / "demo" / f"SH_degree_1_{seed}" for seed in (0, 1)]
+    one, two = (json.loads((folder / "evaluation.json").read_text())["psnr"] for folder in folders)
     assert rows[1]["x1"] == f"{(one + two) / 2:.2f} ± {abs(one - two) / 2:.2f}"
     text = page.read_text()
     assert text.startswith("# Above\n\n<!-- demo")
@@ -525,11 +526,86 @@ def test_trades_are_those_of_gsx_trade_and_the_page_is_written_from_them(
     assert page.read_text() == text
 
 
+def test_settings_of_trades_compose_and_scale_steps() -> None:
+    import trades
+    from gsx.builtin import plugins
+    from gsx.experiments.runs.compose import Compositions
+
+    with Compositions(plugins()) as compositions:
+        for name, words in trades.settings_of_trades(",".join(trades.TRADES), 900).items():
+            settings = compositions.settings(["backbone=gs3d", trades.ADAPTIVE, *words])
+            steps = {trades.HALF: 450, trades.TWICE: 1800}.get(name)
+            assert steps is None or settings.general.iterations == steps
+
+
+def test_fronts_of_trades_by_hand() -> None:
+    """Means over seeds at x4, MB in the mean, seconds of the last seed."""
+    import trades
+
+    def run(x4: float, megabytes: float, seconds: float) -> dict:
+        return {"zoom": {"4": {"psnr": x4}}, "megabytes": megabytes, "train_seconds": seconds}
+
+    settings = [[run(26.0, 20, 90), run(26.2, 20, 100)], [run(26.3, 5, 60), run(26.5, 6, 80)], [run(25, 20, 50)] * 2]
+    assert trades.fronts_of(settings) == {"time": [2, 1], "MB": [1]}
+
+
+def test_settings_of_the_rasterizer_are_measured_against_float64(tmp_path: Path) -> None:
+    """The base settings are within rounding; what changes the picture is further off; formats that fail are named."""
+    import trades
+
+    words = ["--what", "rasterizer", "--quick", "--paths", "eager", "--to", str(tmp_path)]
+    trades.main([*words, "rasterizer.alpha_max=0.995"])
+    rows = read_sections(tmp_path / "trades_rasterizer_cpu_quick.json")["settings"]["rows"]
+    by_name = {row["setting"]: row for row in rows}
+    assert rows[0]["setting"] == "base settings"
+    assert rows[0]["ratio"] == 1.0
+    assert rows[0]["max_error"] < 2e-6
+    assert by_name["evaluation=float64"]["gradient"] < 1e-5
+    assert by_name["alpha_min=0.016"]["max_error"] > 0.005
+    assert by_name["pixel=window"]["most_error"] > 0.001
+    assert any(row.get("front") == "yes" for row in rows)
+    assert len(by_name) == len(rows)
+
+
+@pytest.mark.parametrize("cuda", [False, True])
+@pytest.mark.parametrize("cull", ["published", "tight"])
+def test_changes_of_the_rasterizer_are_valid_settings(cull: str, cuda: bool) -> None:
+    base = RasterSettings(cull=cull)
+    changes = knobs.changes_of(base, ["eager", "compiled"], cuda)
+    assert changes[:2] == [{}, {"path": "compiled"}]
+    assert all(replace(base, **change) != base for change in changes[1:])
+    assert ({"evaluation": "tf32"} in changes) == cuda
+    assert ({"tile_size": 32} in changes) == (cull == "tight")
+    assert {"path": "compiled", "schedule": "chunks" if cuda else "segments"} in changes
+    assert not any("path" in change for change in knobs.changes_of(base, ["eager"], cuda))
+
+
+def test_errors_of_a_picture_made_by_hand() -> None:
+    """Of 20,000 pixels 2 may be left out, so that the third largest counts; channels of a pixel count once."""
+    shot = knobs.shots_of(None, 1, quick=True, device=CPU)[0][0]
+    fields = {name: torch.ones_like(value).double() for name, value in vars(shot.splats).items()}
+    truth = {"image": torch.zeros(3, 100, 200, dtype=torch.float64)} | fields
+    image = torch.zeros(3, 100, 200)
+    image[0, 0, 0], image[1, 0, 0], image[2, 5, 5], image[1, 99, 199], image[0, 50, 50] = 0.5, -0.25, -0.4, 0.25, 0.125
+    errors = knobs.errors_of([shot], [truth | {"image": image, "colours": 1.25 * fields["colours"]}], [truth])
+    assert (errors["max_error"], errors["most_error"]) == (0.5, 0.25)
+    assert (errors["gradient"], errors["field"]) == (pytest.approx(0.25), "colours")
+    squares = 0.5**2 + 0.25**2 + 0.4**2 + 0.25**2 + 0.125**2
+    assert errors["psnr"] == pytest.approx(10 * math.log10(60000 / squares))
+
+
+def test_orientations_of_round_splats_count_against_their_scales() -> None:
+    truth = {"scales": torch.full((1, 3), 10.0).double(), "quats": torch.zeros(1, 4).double()}
+    picture = {"scales": truth["scales"], "quats": torch.tensor([[1e-6, 0, 0, 0]])}
+    error, field = knobs.gradient_error([picture], [truth], [torch.full((1, 3), 0.1)])
+    assert (error, field) == (pytest.approx(1e-6 / (1e-3 * math.sqrt(3) * 10 * 0.1)), "quats")
+
+
 def test_the_page_of_trades_is_that_of_the_committed_figures() -> None:
     import trades
 
     text = trades.PAGE.read_text()
-    assert trades.page(text, read_sections(trades.RESULTS / "trades_cpu.json")) == text
+    assert trades.page(text, read_sections(benchmark.RESULTS / "trades_cpu.json")) == text
 
 
 def test_starts_tell_training_views_beside_held_out_ones(tmp_path: Path) -> None:

@@ -74,8 +74,10 @@ def shots_of(run: Path | None, count: int, quick: bool, device: torch.device) ->
     """Test views of a run, else random splats; and their name."""
     if run is None:
         case = Case(splats=60 if quick else 4000, width=43 if quick else 200, height=30 if quick else 136)
-        shot = Shot(camera=camera_of(case), splats=detached(splats_of(case, device)), background=torch.zeros(3, device=device))
-        return [shot], f"{case.splats:,} random splats, {case.raster} px"
+        splats, background = detached(splats_of(case, device)), torch.zeros(3, device=device)
+        return [
+            Shot(camera=camera_of(case), splats=splats, background=background)
+        ], f"{case.splats:,} random splats, {case.raster} px"
     opened, _ = open_run(run, plugins(), [f"device={device.type}"])
     views = opened.scene.test or opened.train_views
     chosen = views[:: max(1, len(views) // count)][:count]

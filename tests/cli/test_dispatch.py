@@ -44,7 +44,7 @@ def test_help_is_short_says_what_to_type_and_does_not_import_torch() -> None:
     assert result.returncode == 0
     assert len(result.stdout.splitlines()) <= 30
     assert "start here" in result.stdout
-    for verb in ("resume", "eval", "render", "export", "report", "trade", "scenes", "plugins"):
+    for verb in ("resume", "eval", "render", "export", "report", "scenes", "plugins"):
         assert f"gsx {verb}" in result.stdout
 
 
@@ -116,44 +116,6 @@ def test_eval_draws_by_the_path_of_training_and_names_it(
     path, drawn, told = evaluated("rasterizer.path=eager")
     assert (path, drawn) == ("eager", {"eager"})
     assert re.search(r"renders/s are now by the eager path; .* had [\d.]+ by the compiled path", told)
-
-
-def test_trade_of_a_run_a_file_and_the_built_in_scene(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("gsx.experiments.trade.rasterizer.measure.complaint", lambda device: "not asked for here")
-    monkeypatch.setattr("gsx.experiments.trade.rasterizer.measure.available", lambda device: False)
-    quick, eager = ["--repeats", "1"], ["rasterizer.path=eager"]  # nothing to compile
-    asked = [*quick, "--knobs=cull", "--views=1", *eager, "rasterizer.chunk=8"]
-    assert main(["trade", "rasterizer", str(run_folder), *asked]) == 0
-    out = capsys.readouterr().out
-    assert out.splitlines()[-1] == str(run_folder / "trade" / "trade.html")
-    assert "cull=tight" in out
-    assert "every pixel within 0.001: " in out
-    content = json.loads((run_folder / "trade" / "trade.json").read_text())
-    assert content["base"]["chunk"] == 8
-    assert len(content["views"]) == 1
-
-    file = tmp_path / "x.ply"
-    assert main(["export", str(run_folder), str(file)]) == 0
-    other = [*eager, "rasterizer.tile_size=16", "--knobs=cull", "--repeats=1", "--views=1", "--max-error=1"]
-    assert main(["trade", "rasterizer", str(file), *other, "--to", str(tmp_path / "a" / "b")]) == 0
-    assert (tmp_path / "a" / "b" / "trade.html").is_file()
-    assert "every pixel within 1: " in capsys.readouterr().out
-
-    small = ["scene.width=48", "scene.height=36", "scene.points=100", "scene.train_views=3", "scene.test_views=1"]
-    small += ["scene.samples=1", "device=cpu", "--knobs", "cull,tile_size", "--to", str(tmp_path / "c")]
-    assert main(["trade", "rasterizer", *small, *quick]) == 0
-    assert "points of scene demo" in capsys.readouterr().err
-    assert len(json.loads((tmp_path / "c" / "trade.json").read_text())["views"]) == 1
-
-
-def test_trade_help_lists_its_options(capsys: pytest.CaptureFixture[str]) -> None:
-    for asked, option in {"": "gsx trade training", "rasterizer": "--max-error", "training": "--budget-mb"}.items():
-        with pytest.raises(SystemExit) as end:
-            main(["trade", *filter(None, [asked]), "--help"])
-        assert end.value.code == 0
-        assert option in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -416,27 +378,6 @@ BAD = {
     "render at no speed": lambda t: ["render", str(t / "run"), "--orbit", str(t / "o.gif"), "--fps", "1e-300"],
     "export too closely": lambda t: ["export", str(t / "run"), "--bake", "1e308"],
     "compact without end": lambda t: ["compact", str(empty_folder(t / "run")), "--steps", "9" * 26],
-    "trade nothing": lambda t: ["trade"],
-    "trade something else": lambda t: ["trade", "resterizer"],
-    "trade nowhere": lambda t: ["trade", "rasterizer", str(t / "nowhere")],
-    "trade two": lambda t: ["trade", "rasterizer", str(t / "a"), str(t / "b")],
-    "trade no run": lambda t: ["trade", "rasterizer", str(empty_folder(t / "r"))],
-    "trade a text": lambda t: ["trade", "rasterizer", str(next(folder_of_text(t / "p").iterdir()))],
-    "trade a broken file": lambda t: ["trade", "rasterizer", str(broken_ply(t / "x.ply"))],
-    "trade without budget": lambda t: ["trade", "rasterizer", "--max-error", "-1"],
-    "trade no number": lambda t: ["trade", "rasterizer", "--max-error", "small"],
-    "trade no rounds": lambda t: ["trade", "rasterizer", "--repeats", "0"],
-    "trade fewer than none": lambda t: ["trade", "rasterizer", "--combinations", "-1"],
-    "trade half a view": lambda t: ["trade", "rasterizer", "--views", "0.5"],
-    "trade no such knob": lambda t: ["trade", "rasterizer", "--knobs", "tilesize"],
-    "trade no such option": lambda t: ["trade", "rasterizer", "--max-eror", "1"],
-    "trade option cut off": lambda t: ["trade", "rasterizer", "--to"],
-    "trade no such trade": lambda t: ["trade", "training", "--trades", "primitive", "--to", str(t / "t")],
-    "trade no such settings": lambda t: ["trade", "training", "--settings", "setings", "--to", str(t / "t")],
-    "trade less than nothing": lambda t: ["trade", "training", "--max-drop-db", "-0.1"],
-    "trade no seed": lambda t: ["trade", "training", "--seeds", "0,0"],
-    "trade no composition": lambda t: ["trade", "training", "iteration=5", "--to", str(t / "t")],
-    "trade typo in key": lambda t: ["trade", "rasterizer", "rasterizer.tilesize=16"],
     "bad device": lambda t: words(t / "run", "device=tpu"),
 }
 
@@ -540,17 +481,13 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
         lambda t: ["-m", "seed=0,1", "hydra/launcher=processes", "hydra.launcher.n_jobs=0", f"output={t / 'out'}"],
         "hydra.launcher.n_jobs is 0; give how many processes",
     ),
-    "more pictures than anybody waits for": (
-        lambda t: ["trade", "rasterizer", "--views", "100000", "--to", str(t / "t")],
-        "gsx trade rasterizer --views is 100,000: give a number from 1 to 100",
-    ),
     "a folder for a movie": (
         lambda t: ["render", str(t / "run"), "--orbit", str(t / "a.gif"), "--to", str(t / "to")],
         "--to FOLDER is for pictures",
     ),
     "frames of no orbit": (lambda t: ["render", str(t / "run"), "--frames", "3"], "go with --orbit FILE"),
     "axes of no spz": (lambda t: ["export", str(t / "run"), str(t / "x.ply"), "--axes", "rdf"], "is of .spz files"),
-    "no trades": (lambda t: ["trade", "training", "--trades", "", "--to", str(t / "t")], "--trades names none"),
+    "trade": (lambda t: ["trade", "training"], "whose page draws the fronts"),
     "a choice that is there twice": (
         lambda t: words(t / "run", "iterations=1", "augmenter=[upscale,bootstrap,upscale]"),
         "augmenter=[upscale,bootstrap,upscale]: upscale is there twice, and works once",
@@ -583,10 +520,6 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     ),
     "a photograph of no run": (lambda t: ["photographs"], "the following arguments are required: RUN. See"),
     "an export of no run": (lambda t: ["export"], "the following arguments are required: RUN|FILE. See"),
-    "trade with a place of its own": (
-        lambda t: ["trade", "training", f"output={t / 'o'}", "--to", str(t / "t")],
-        "runs go below --to FOLDER",
-    ),
 }
 
 

@@ -63,30 +63,11 @@ def positive(kind: type[int] | type[float]) -> Callable[[str], Any]:
     return read
 
 
-def not_negative(word: str) -> float:
-    """A finite number of 0 or more."""
-    try:
-        number = float(word)
-    except ValueError:
-        number = -1.0
-    if not 0 <= number < float("inf"):
-        raise argparse.ArgumentTypeError(f"'{word}' is no number of 0 or more: give one, for example 0.1")
-    return number
-
-
 def whole(word: str) -> int:
     """A whole number of 0 or more."""
     if not word.isdecimal():
         raise argparse.ArgumentTypeError(f"'{word}' is no whole number of 0 or more: give one, for example 4")
     return int(word)
-
-
-def different_numbers(word: str) -> list[int]:
-    """Whole numbers by commas, all different."""
-    parts = word.split(",")
-    if not all(part.isdecimal() for part in parts) or len(set(parts)) < len(parts):
-        raise argparse.ArgumentTypeError(f"'{word}' is no list of different whole numbers: give one, for example 0,1,2")
-    return [int(part) for part in parts]
 
 
 def refuse_beyond(flag: str, value: float, bounds: Range) -> None:

@@ -12,7 +12,6 @@ from gsx.cli.folder import is_given, train_from
 from gsx.cli.look import verb_datasets, verb_explain, verb_plugins, verb_report, verb_scenes
 from gsx.cli.messages import as_bytes, discard_unwritten, explained, unheard
 from gsx.cli.runs import verb_eval, verb_export, verb_photographs, verb_render, verb_view
-from gsx.cli.trade import verb_trade
 from gsx.cli.train import verb_resume, verb_train
 from gsx.core.errors import ConfigError, nearest
 from gsx.engine.processes import processes
@@ -35,8 +34,6 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx export RUN|FILE [TO]  splat file by suffix (.ply, .compressed.ply, .spz, .sog, .glb), or .html: one page to send
   gsx compact RUN|FILE      the smallest model that looks the same: --max-drop-db 0.1; FILE with scene=...
   gsx report DIR [DIR ...]  report.html of a run, or one page over all runs of some folders; --to FOLDER
-  gsx trade training [K=V ...]  what fewer primitives, steps, bands ... cost: --budget-mb 20, --target-seconds 300
-  gsx trade rasterizer RUN  which settings draw a model (RUN, FILE, or none) fastest within an error
   gsx scenes PATH           what is this folder: format, cameras, images, points, problems
   gsx datasets [NAME ...]   the paper's datasets: what is expected below data_root=FOLDER, found, missing
   gsx explain KEY           a key or group of the configuration: value, range, comment, and the file that sets it
@@ -51,6 +48,10 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
 
 Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1,2]'.
 """
+TRADE_MOVED = (
+    "gsx trade is gone. Compare settings of a training with `gsx -m KEY=A,B ...`, whose page draws the fronts; "
+    "settings of the rasterizer are measured by `python benchmarks/trades.py --what rasterizer` (docs/trade-offs.md)"
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -105,6 +106,8 @@ def dispatch(arguments: list[str]) -> int:
         return 0
     if not arguments or is_override(arguments[0]):
         return verb_train(arguments)
+    if arguments[0] == "trade":
+        raise ConfigError(TRADE_MOVED)
     if arguments[0] not in VERBS and is_given(arguments[0]):
         set_up_logging()
         return train_from(arguments)
@@ -124,7 +127,6 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "compact": verb_compact,
     "view": verb_view,
     "report": verb_report,
-    "trade": verb_trade,
     "scenes": verb_scenes,
     "datasets": verb_datasets,
     "explain": verb_explain,

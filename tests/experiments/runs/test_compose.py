@@ -19,9 +19,8 @@ from gsx.experiments.runs.typed import typed
 from gsx.scenes.options import SceneOptions
 
 CONF = Path(__file__).parents[3] / "conf"
-GROUPS = sorted({path.parent.name for path in CONF.glob("*/*.yaml")} - {"variant", "checks", "trade"})
-"""Variants are in test_variants.py; checks, which regenerators choose, in test_checks.py; what gsx trade tries in
-test_training_trade.py."""
+GROUPS = sorted({path.parent.name for path in CONF.glob("*/*.yaml")} - {"variant", "checks"})
+"""Variants are in test_variants.py; checks, which regenerators choose, in test_checks.py."""
 APART = ("augmenter", "experiment", "protocol", "rasterizer", "tracker")
 """Groups whose files set nothing that those of another of them set, so that one of each is composed at once."""
 NEEDS = {

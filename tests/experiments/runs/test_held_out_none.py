@@ -28,8 +28,6 @@ from gsx.experiments.runs.load_scene import held_out_none, load_scene
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.render import render_test_views
 from gsx.experiments.tables.table import measured, problem_of
-from gsx.experiments.trade.training.measure import Trial
-from gsx.experiments.trade.training.measure import measured as traded
 from gsx.trackers.figures import evaluation_figures
 
 WORDS = ("iterations=4", "scene.split=none", "rasterizer=eager", "eval.zoom=[1,2]", "training.test_points=2")
@@ -91,10 +89,6 @@ def test_what_needs_test_views_is_refused_with_the_remedy(folder: Path, tmp_path
     assert not (tmp_path / "pictures").exists()
     with pytest.raises(ConfigError, match="choose another split than scene"):
         evaluate_file(folder / "point_cloud.ply", ["scene=demo", "scene.split=none"])
-    given = ["scene=demo", "scene.split=none", "iterations=4"]
-    trial = Trial(given=given, seeds=[0], folder=tmp_path, job=lambda _: folder, plugins=plugins())
-    with pytest.raises(InputError, match=r"gsx trade compares held-out figures, choose another scene\.split"):
-        traded(trial, [], 1)
 
 
 def test_files_are_compared_in_training_views(folder: Path, tmp_path: Path) -> None:

@@ -264,16 +264,13 @@ def pareto_front(costs: Sequence[float], gains: Sequence[float]) -> list[int]:
     return sorted((i for i in range(len(costs)) if not beaten(i)), key=lambda i: (costs[i], gains[i]))
 
 
-def scatter(dots: Sequence[Dot], *, x_label: str, falling: bool = False) -> Markup:
-    """Points with the Pareto front (lower x, higher y) joined and named; empty without points.
-
-    `falling`: lower y is better, on a logarithmic axis (errors; all must be positive).
-    """
+def scatter(dots: Sequence[Dot], *, x_label: str) -> Markup:
+    """Points with the Pareto front (lower x, higher y) joined and named; empty without points."""
     if not dots:
         return Markup()
     log = min(dot.x for dot in dots) > 0 and max(dot.x for dot in dots) > 8 * min(dot.x for dot in dots)
-    plot = Plot(axis_of((dot.x for dot in dots), log=log), axis_of((dot.y for dot in dots), log=falling))
-    front = pareto_front([dot.x for dot in dots], [-dot.y if falling else dot.y for dot in dots])
+    plot = Plot(axis_of((dot.x for dot in dots), log=log), axis_of(dot.y for dot in dots))
+    front = pareto_front([dot.x for dot in dots], [dot.y for dot in dots])
     line = plot.points([dots[i].x for i in front], [dots[i].y for i in front])
     body = plot.frame(x_label) + f'<polyline class="front" points="{line}"/>'
     body += "".join(scatter_dot(plot, dot, i in front) for i, dot in enumerate(dots))

@@ -1,1 +1,0 @@
-"""What each setting of the rasterizer costs, and what it changes."""

@@ -1,1 +1,0 @@
-"""What settings of a training cost, on a scene: trained, measured, compared."""
