@@ -15,7 +15,7 @@ from tiny import OVERRIDES, final_tensors, tiny_run
 
 import gsx
 import gsx.api
-from gsx.api import overrides
+from gsx.api import words_of
 from gsx.builtin import plugins
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import read_json
@@ -146,7 +146,7 @@ def test_values_become_words_of_the_command_line() -> None:
         "folder": None,
         "x": np.int64(3),
     }
-    assert overrides(given) == [
+    assert words_of(given) == [
         "seed=3",
         "eval.zoom=[1,2.5]",
         "eval.quantise=true",
@@ -158,14 +158,14 @@ def test_values_become_words_of_the_command_line() -> None:
 
 @pytest.mark.parametrize("name", ["it's", "a, b", "[x]", "back\\slash", "q\\'", 'two "', "é=ü", "end\\", "\\\\$a'\\\\"])
 def test_texts_arrive_as_they_are(name: str) -> None:
-    settings = compose([*OVERRIDES, *overrides({"folder": name})], plugins())
+    settings = compose([*OVERRIDES, *words_of({"folder": name})], plugins())
     assert settings.general.folder == name
 
 
 @pytest.mark.parametrize("name", ["${oc.env:HOME}", "x\\${seed}", "\\\\${a}'"])
 def test_texts_are_looked_up_nowhere(name: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(f"folder is '{name}'; a run's configuration holds no")):
-        compose([*OVERRIDES, *overrides({"folder": name})], plugins())
+        compose([*OVERRIDES, *words_of({"folder": name})], plugins())
 
 
 @pytest.mark.parametrize("wrong", [{"iteration": 3}, {"eval": {"zoom": "x"}}, {"backbone": "gs4d"}])
