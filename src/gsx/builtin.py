@@ -8,13 +8,13 @@ from gsx.core.plugins import Plugins, Registry, hookimpl, load_plugins
 
 @hookimpl
 def gsx_register(registry: Registry) -> None:
-    """Scenes, backbones, augmenters, regenerators and trackers of gsx itself."""
+    """Registers scenes, backbones, augmenters, regenerators and trackers of gsx itself."""
     for add in (add_scenes, add_backbones, add_augmenters, add_regenerators, add_diffusion, add_trackers):
         add(registry)
 
 
 def add_scenes(registry: Registry) -> None:
-    """Loaders, a format each; of two that can read a folder the later is the more telling."""
+    """Registers loaders, one for each format; of two that can read a folder the later is the more specific."""
     from gsx.scenes import blender, bungee, colmap, demo, photos, room, transforms
 
     registry.add("scene", "demo", demo.load, demo.DemoOptions)
@@ -27,7 +27,7 @@ def add_scenes(registry: Registry) -> None:
 
 
 def add_backbones(registry: Registry) -> None:
-    """Free Gaussians and anchors, with and without levels and filters."""
+    """Registers free Gaussians and anchors, with and without levels and filters."""
     from gsx.backbones.anchor_options import NeuralOptions
     from gsx.backbones.anchors import neural_anchors
     from gsx.backbones.gs3d import gs3d
@@ -43,7 +43,7 @@ def add_backbones(registry: Registry) -> None:
 
 
 def add_augmenters(registry: Registry) -> None:
-    """One procedure under four names, each with numbers of its own."""
+    """Registers one procedure under four names, each with numbers of its own."""
     from gsx.augmenters.pseudo_details import PseudoDetails
     from gsx.augmenters.pseudo_options import PseudoOptions
 
@@ -52,7 +52,7 @@ def add_augmenters(registry: Registry) -> None:
 
 
 def add_regenerators(registry: Registry) -> None:
-    """Filters, what the scene itself teaches, and functions."""
+    """Registers filters, networks that learn from the scene itself, and functions."""
     from gsx.regenerators.called import Called, CalledOptions
     from gsx.regenerators.classical import Oracle, PlainOptions, Resampled, Unchanged
     from gsx.regenerators.scene_restorer import RestorerOptions, SceneRestorer
@@ -67,7 +67,7 @@ def add_regenerators(registry: Registry) -> None:
 
 
 def add_diffusion(registry: Registry) -> None:
-    """Diffusion models; their packages are imported when one is used."""
+    """Registers diffusion models, whose packages are imported when one is used."""
     from gsx.regenerators.diffusion.cascade import Cascade, CascadeOptions
     from gsx.regenerators.diffusion.model_specs import SD_X2_LATENT, SD_X4, SDXL_TURBO
     from gsx.regenerators.diffusion.options import PipelineOptions, RestorerOptions, UpscalerOptions
@@ -81,7 +81,7 @@ def add_diffusion(registry: Registry) -> None:
 
 
 def add_trackers(registry: Registry) -> None:
-    """Listeners that tell other programs of a run."""
+    """Registers listeners that report a run to other programs."""
     from gsx.trackers.mlflow import MLflow, MLflowOptions
     from gsx.trackers.tensorboard import TensorBoard, TensorBoardOptions
 
@@ -90,5 +90,5 @@ def add_trackers(registry: Registry) -> None:
 
 
 def plugins() -> Plugins:
-    """Built-in and installed plugins."""
+    """Returns built-in and installed plugins."""
     return load_plugins([("gsx", sys.modules[__name__])])

@@ -17,14 +17,14 @@ PLACES = ("output", "folder", "reuse")
 
 
 def refuse_taken(verb: str, overrides: Sequence[str], remedies: Mapping[str, str]) -> None:
-    """Raise ConfigError for an override of what a verb's own flags say; `remedies` by key."""
+    """Raises ConfigError for an override of what a verb's own flags say; `remedies` by key."""
     for word in overrides:
         if remedy := remedies.get(word.lstrip("+~").partition("=")[0]):
             raise ConfigError(f"{verb} does not take '{word}': {remedy}")
 
 
 def run_arguments(verb: str, arguments: list[str], description: str, flags: str = "") -> tuple[Path, list[str]]:
-    """The run folder and the overrides after it; `flags`: others that the verb has, for its help."""
+    """Parses a run folder and the overrides after it; `flags`: others that the verb has, for its help."""
     parser = Parser(prog=f"gsx {verb}", usage=f"%(prog)s RUN [KEY=VALUE ...]{flags}", description=description)
     parser.add_argument("run", metavar="RUN", help="run folder")
     parser.add_overrides("values that take the place of the run's own")
@@ -38,17 +38,17 @@ class Parser(argparse.ArgumentParser):
     """Mistakes become errors of ours: one sentence, without the usage text."""
 
     def add_overrides(self, told: str) -> None:
-        """KEY=VALUE, as many as there are, as `overrides`."""
+        """Adds KEY=VALUE, as many as there are, as `overrides`."""
         # argparse calls required what has no default
         self.add_argument("overrides", nargs="*", default=[], metavar="KEY=VALUE", help=told)
 
     def error(self, message: str) -> NoReturn:
-        """Raise ConfigError."""
+        """Raises ConfigError."""
         raise ConfigError(f"{self.prog}: {message}. See {self.prog} --help")
 
 
 def positive(kind: type[int] | type[float]) -> Callable[[str], Any]:
-    """What reads a finite number above 0 from a word."""
+    """Returns a reader of finite numbers above 0."""
 
     def read(word: str) -> int | float:
         try:
@@ -64,20 +64,20 @@ def positive(kind: type[int] | type[float]) -> Callable[[str], Any]:
 
 
 def whole(word: str) -> int:
-    """A whole number of 0 or more."""
+    """Reads a whole number of 0 or more."""
     if not word.isdecimal():
         raise argparse.ArgumentTypeError(f"'{word}' is no whole number of 0 or more: give one, for example 4")
     return int(word)
 
 
 def refuse_beyond(flag: str, value: float, bounds: Range) -> None:
-    """Raise InputError for a number of the command line that is outside of its range."""
+    """Raises InputError for a number of the command line that is outside of its range."""
     if value not in bounds:
         raise InputError(f"{flag} is {value:,}: give a number {bounds}")
 
 
 def new_folder(folder: Path) -> Path:
-    """The folder, made where it is missing.
+    """Makes a folder where it is missing, and returns it.
 
     Raises:
         InputError: it cannot be made.

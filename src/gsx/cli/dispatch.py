@@ -55,7 +55,7 @@ TRADE_MOVED = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted,
+    """Runs the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted,
     141 nobody reads on (`| head`)."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors in ("strict", "surrogateescape"):
@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def dispatch_together(arguments: list[str]) -> int:
-    """Train or resume on several processes.
+    """Trains or resume on several processes.
 
     Raises:
         ConfigError: anything else is asked for.
@@ -97,7 +97,7 @@ def dispatch_together(arguments: list[str]) -> int:
 
 
 def dispatch(arguments: list[str]) -> int:
-    """Find the verb and run it."""
+    """Finds the verb and run it."""
     if arguments[:1] == ["help"] or ({"--help", "-h"} & set(arguments) and arguments[0] not in VERBS):
         sys.stdout.write(HELP)
         return 0

@@ -1,4 +1,4 @@
-"""gsx FOLDER: find out what it is, say what is done with it, and do it."""
+"""gsx FOLDER: detects the input, prints the equivalent command, trains."""
 
 import logging
 from collections.abc import Sequence
@@ -15,12 +15,12 @@ logger = logging.getLogger("gsx.cli")
 
 
 def is_given(word: str) -> bool:
-    """Whether a word of the command line is a folder or file that one may train from."""
+    """Returns whether a word of the command line is a folder or file."""
     return at_home(word).exists()
 
 
 def train_from(arguments: list[str]) -> int:
-    """gsx FOLDER|VIDEO [KEY=VALUE ...]: train from it, as whatever it is."""
+    """gsx FOLDER|VIDEO [KEY=VALUE ...]: trains from it, as whatever it is."""
     path, overrides = at_home(arguments[0]), arguments[1:]
     odd = next((word for word in overrides if "=" not in word or word.startswith(("scene=", "scene.path="))), "")
     if odd:
@@ -28,35 +28,26 @@ def train_from(arguments: list[str]) -> int:
     with loading():
         loaded = plugins()
     words = scene_words(path, overrides, loaded)
-    logger.info("%s is %s", path, told(words, path))
+    scene = words[0].partition("=")[2]
+    kind = "a video" if path.is_file() and scene == "photos" else f"read as scene={scene}"
+    logger.info("%s is %s", path, kind)
     logger.info("%s", command(*words, *overrides))
     return verb_train([*words, *overrides])
 
 
 def scene_words(path: Path, overrides: Sequence[str], loaded: Plugins) -> list[str]:
-    """Words of the command line for the scene that a folder or a video is.
+    """Returns words of the command line for the scene that a folder or a video is.
 
     Raises:
         InputError: it is none; of a splat file the message says what can be done with it.
     """
-    from gsx.experiments.runs.inspect import readable, refuse_run, refuse_splats, unknown
+    from gsx.experiments.runs.inspect import scene_loaders
     from gsx.experiments.runs.overrides import word_of
     from gsx.experiments.runs.video import is_video, photos_of
 
-    refuse_run(path)
-    refuse_splats(path)
     if is_video(path):
         output = next((word.partition("=")[2] for word in overrides if word.startswith("output=")), "outputs")
         return ["scene=photos", word_of("scene.path", str(photos_of(path, Path(output))))]
-    loaders = readable(path, loaded)
-    if not loaders:
-        raise unknown(path, loaded)
-    loader, its = loaders[0]
+    loader, its = scene_loaders(path, loaded)[0]
     more = [word_of(f"scene.{key}", value) for key, value in its.overrides(path).items()]
     return [f"scene={loader.name}", word_of("scene.path", str(path)), *more]
-
-
-def told(words: Sequence[str], path: Path) -> str:
-    """What it is, in words."""
-    scene = words[0].partition("=")[2]
-    return "a video" if path.is_file() and scene == "photos" else f"read as scene={scene}"

@@ -11,7 +11,7 @@ from gsx.experiments.runs.job import INTERRUPTED
 
 
 def explained(error: BaseException) -> int:
-    """The exit code of an error that people can mend, which is shown; others are raised again."""
+    """Shows an error that people can correct and returns its exit code; raises others again."""
     if isinstance(error, GsxError):
         return complain(str(error))
     if isinstance(error, OSError):
@@ -23,7 +23,7 @@ def explained(error: BaseException) -> int:
 
 
 def complain(sentence: str) -> int:
-    """Show an error as one sentence."""
+    """Shows an error as one sentence."""
     say(f"gsx: {sentence}\n", as_error=True)
     return 2
 
@@ -33,7 +33,7 @@ UNHEARD = 128 + 13
 
 
 def unheard(error: BrokenPipeError) -> int:
-    """Say nothing more on standard output, if it is that which nobody reads any more (`gsx plugins | head -3`)."""
+    """Says nothing more on standard output, if it is that which nobody reads any more (`gsx plugins | head -3`)."""
     if not unread():
         return explained(error)
     discard_output()
@@ -41,14 +41,13 @@ def unheard(error: BrokenPipeError) -> int:
 
 
 def discard_output() -> None:
-    """Nothing more goes to standard output. What it has not taken is lost: Python would try once more at its end, and
-    complain in words of its own."""
+    """Discards standard output: Python would write again at its end, and complain in words of its own."""
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
 def discard_unwritten() -> None:
-    """The same, if standard output takes nothing (a full disk)."""
+    """Discards standard output if it takes nothing (a full disk)."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -56,7 +55,7 @@ def discard_unwritten() -> None:
 
 
 def unread() -> bool:
-    """Whether standard output is a pipe without a reader."""
+    """Returns whether standard output is a pipe without a reader."""
     try:
         watched = select.poll()
         watched.register(sys.stdout.fileno(), 0)
@@ -66,7 +65,7 @@ def unread() -> bool:
 
 
 def os_sentence(error: OSError) -> str:
-    """A failure of the file system with its remedy."""
+    """Returns a failure of the file system with its remedy."""
     where = f" ({error.filename})" if error.filename else ""
     remedy = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "check that path and its permissions"
     place = "a writable place: output=FOLDER to train, --to FOLDER where a command has that"
@@ -74,7 +73,7 @@ def os_sentence(error: OSError) -> str:
 
 
 def as_bytes(error: UnicodeError) -> tuple[bytes, int]:
-    """What standard output has no letters for: bytes of names of files as they are, all else as escapes.
+    """Encodes what standard output has no letters for: bytes of file names as they are, all else as escapes.
 
     Raises:
         UnicodeError: it was to be read.
@@ -86,6 +85,6 @@ def as_bytes(error: UnicodeError) -> tuple[bytes, int]:
 
 
 def byte_or_escape(letter: str) -> bytes:
-    """A byte that Python took for no text (PEP 383), or the escape of a letter."""
+    """Returns a byte that Python took for no text (PEP 383), or the escape of a letter."""
     number = ord(letter) - 0xDC00
     return bytes([number]) if 0x80 <= number <= 0xFF else letter.encode("ascii", "backslashreplace")

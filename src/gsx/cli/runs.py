@@ -79,7 +79,7 @@ def verb_photographs(arguments: list[str]) -> int:
 
 
 def add_axes(parser: Parser, flag: str = "--axes") -> None:
-    """Add a flag for the axes of a splat file that is read."""
+    """Adds a flag for the axes of a splat file that is read."""
     values = (
         "of the FILE: rub (SPZ as specified), rdf (as trained), any three letters (auto: as it states, or its format)"
     )
@@ -87,7 +87,7 @@ def add_axes(parser: Parser, flag: str = "--axes") -> None:
 
 
 def refuse_axes_of_run(verb: str, given: argparse.Namespace) -> None:
-    """Raise InputError for --axes of a run, whose axes are those of its scene."""
+    """Raises InputError for --axes of a run, whose axes are those of its scene."""
     if given.axes != AUTO and splat_file_at(given.target).is_dir():
         raise InputError(f"{verb}: --axes {given.axes} is for splat files, {given.target} is a run: leave it out")
 
@@ -121,7 +121,7 @@ def verb_render(arguments: list[str]) -> int:
 
 
 def rendered(given: argparse.Namespace) -> Path:
-    """Carry out `gsx render`; returns the file or folder written."""
+    """Carries out `gsx render`; returns the file or folder written."""
     with loading():
         from gsx.core.files import remove_partial
         from gsx.experiments.runs.open import open_run
@@ -187,7 +187,7 @@ def verb_view(arguments: list[str]) -> int:
 
 
 def add_spz_form(parser: Parser) -> None:
-    """Add the flags that say how .spz is written."""
+    """Adds the flags that say how .spz is written."""
     parser.add_argument(
         "--axes",
         choices=(SPECIFIED, TRAINED),
@@ -204,7 +204,7 @@ def add_spz_form(parser: Parser) -> None:
 
 
 def refuse_spz_form(given: argparse.Namespace) -> None:
-    """Raise InputError for `gsx export` flags that are about .spz where another file is written."""
+    """Raises InputError for `gsx export` flags that are about .spz where another file is written."""
     flags = {"--axes": (given.axes, SPECIFIED), "--spz-version": (given.spz_version, SPZ_VERSIONS[0])}
     for flag, (value, usual) in flags.items():
         if value != usual and (given.file is None or given.file.suffix.lower() != ".spz"):
@@ -223,7 +223,7 @@ def verb_export(arguments: list[str]) -> int:
 
 
 def export_parser() -> Parser:
-    """Return the parser of `gsx export`."""
+    """Returns the parser of `gsx export`."""
     description = (
         f"Write a splat file, read back and compared; its suffix says which: {', '.join(WRITTEN)}; or .html, one page "
         "with a viewer in it that opens from disk. Of a splat file: the same splats in a file of another kind."
@@ -248,7 +248,7 @@ def export_parser() -> Parser:
 
 
 def refuse_export_options(given: argparse.Namespace) -> None:
-    """Raise InputError for options of `gsx export` that are out of range, or that do not go together."""
+    """Raises InputError for options of `gsx export` that are out of range, or that do not go together."""
     with loading():
         from gsx.experiments.runs.export import refuse_export
 
@@ -262,7 +262,7 @@ def refuse_export_options(given: argparse.Namespace) -> None:
 
 
 def exported(given: argparse.Namespace) -> Path:
-    """Write the model of a run as a splat file or a page; return that.
+    """Writes the model of a run as a splat file or a page; return that.
 
     Raises:
         InputError: an option is for splat files alone, or the format cannot hold the model.
@@ -298,7 +298,7 @@ def exported(given: argparse.Namespace) -> Path:
 
 
 def converted(source: Path, given: argparse.Namespace) -> Path:
-    """Write the splats of a file as a file of another kind; return that.
+    """Writes the splats of a file as a file of another kind; return that.
 
     Raises:
         InputError: it names no file to write, an option is for runs alone, or the file cannot be read or written.

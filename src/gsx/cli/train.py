@@ -56,7 +56,7 @@ def verb_train(arguments: list[str]) -> int:
 
 
 def tell_report(code: int, *folders: Path) -> int:
-    """Say where the report of a run is that has come to its end; returns the exit code."""
+    """Says where the report of a run is that has come to its end; returns the exit code."""
     if code == 0:
         say("".join(f"{folder / 'report.html'}\n" for folder in folders))
     return code
@@ -76,7 +76,7 @@ def fill_table(arguments: list[str]) -> int:
 
 
 def hand_to_hydra(arguments: list[str]) -> int:
-    """Multirun, completion and information flags, by Hydra's own command line; a multirun ends with one report."""
+    """Runs multiruns, completion and information flags by Hydra's command line; a multirun ends with one report."""
     with loading():
         from gsx.experiments.runs.launched import waiting_for_all
         from gsx.experiments.runs.multirun import check_overrides, hydra_main, launch
@@ -110,7 +110,7 @@ def hand_to_hydra(arguments: list[str]) -> int:
 
 
 def refuse_for_sweeps(arguments: list[str]) -> None:
-    """Raise ConfigError for flags that train nothing, and for what gsx says itself of a multirun."""
+    """Raises ConfigError for flags that train nothing, and for what gsx says itself of a multirun."""
     for word in arguments:
         if word.startswith("-") and word not in ("-m", "--multirun"):
             raise ConfigError(f"-m trains several runs, and {word} trains none: leave one of them out")
@@ -119,7 +119,7 @@ def refuse_for_sweeps(arguments: list[str]) -> None:
 
 
 def new_sweep(output: Path) -> Path:
-    """A new folder for the record of a multirun."""
+    """Makes a new folder for the record of a multirun."""
     for number in range(1, 1000):
         stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
         folder = output / "sweeps" / (stamp if number == 1 else f"{stamp}_{number}")
@@ -130,7 +130,7 @@ def new_sweep(output: Path) -> Path:
 
 
 def close_sweep(sweep: Path) -> int:
-    """Report on the runs that a multirun has made; returns the worst exit code of its jobs."""
+    """Reports on the runs that a multirun has made; returns the worst exit code of its jobs."""
     from gsx.core.files import read_json
     from gsx.experiments.reports.overview import write_overview
 
@@ -142,9 +142,9 @@ def close_sweep(sweep: Path) -> int:
 
 
 def sweep_job(config: Any) -> int:
-    """One job of a multirun or of a table, in this process or in one of a launcher's; its record stays with the sweep.
+    """Runs one job of a multirun or a table, here or in a launcher's process; its record stays with the sweep.
 
-    An error is shown and does not end the others; Ctrl-C does, where a launcher's processes are in the end of all.
+    An error is shown and does not end the other jobs; Ctrl-C does, where a launcher's processes are in the end of all.
     """
     from gsx.core.files import write_json
     from gsx.experiments.runs.launched import ended_from_without, is_launched

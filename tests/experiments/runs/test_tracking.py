@@ -167,7 +167,7 @@ def test_a_listener_that_fails_too_does_not_hide_why(tmp_path: Path, caplog: pyt
 
     with pytest.raises(RuntimeError, match="no memory"):
         heard_run(tmp_path / "run", listener=Worse(RuntimeError("no memory")))
-    assert "a listener failed while it heard of the run's failure: and no disk" in caplog.text
+    assert "a listener of the run's failure failed: and no disk" in caplog.text
 
 
 def test_a_run_that_never_began_is_not_told(tmp_path: Path) -> None:

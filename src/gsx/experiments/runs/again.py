@@ -15,7 +15,7 @@ from gsx.experiments.runs.rasterizer_path import warm
 
 
 def evaluate_again(folder: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """evaluation.json, pictures, splat file and report of a run, drawn by the path that trained it.
+    """Writes evaluation.json, pictures, splat file and report of a run, drawn by the path that trained it.
 
     Raises:
         ConfigError, InputError: an override is wrong, the folder is no run, or somebody trains in it.

@@ -5,7 +5,6 @@ covariance, and harmonics fitted to the colours it is seen with; what it has of 
 as they are or zoomed. Least squares, weighted by opacity, with a ridge on the higher bands.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -29,12 +28,12 @@ RIDGE = 0.03
 FAINTEST = 1 / 255
 """Splats of a lower mean opacity are left out: nothing draws them (3D-GS)."""
 MOST_CAMERAS = 200
-"""Training cameras that are asked, evenly over all."""
+"""Training cameras, evenly over all."""
 
 
 @dataclass(eq=False)
 class Sums:
-    """What the cameras have told of S splats so far."""
+    """Sums over cameras for S splats."""
 
     visits: Float[Tensor, "S"]
     weights: Float[Tensor, "S"]
@@ -48,7 +47,7 @@ class Sums:
 
     @classmethod
     def of(cls, slots: int, device: torch.device) -> "Sums":
-        """Nothing yet."""
+        """Returns sums over no camera."""
         size = (DEGREE + 1) ** 2
 
         def zeros(*shape: int) -> Tensor:
@@ -57,7 +56,7 @@ class Sums:
         return cls(zeros(), zeros(), zeros(3), zeros(3, 3), zeros(size, size), zeros(size, 3))
 
     def add(self, splats: Splats, slots: Int[Tensor, "M"], visited: Int[Tensor, "V"], camera: Camera) -> None:
-        """What one camera draws, and what it could have drawn."""
+        """Adds what one camera draws; `visited`: what it could have drawn."""
         weight = splats.log_opacities.exp()
         directions = normalize(offsets_from(splats.means, camera.centre), dim=1)
         basis = torch.cat([torch.full_like(weight[:, None], BAND_0), harmonics(directions, DEGREE)], 1)
@@ -71,7 +70,7 @@ class Sums:
         self.right.index_add_(0, slots, weighted[:, :, None] * (splats.colours - 0.5)[:, None])
 
     def gaussians(self) -> Gaussians:
-        """The splats that are not too faint."""
+        """Returns the splats that are not too faint."""
         opacity = self.weights / self.visits.clamp_min(1)
         kept = opacity >= FAINTEST
         weights = self.weights[kept]
@@ -90,7 +89,7 @@ class Sums:
 
 
 def principal_axes(covariances: Float[Tensor, "N 3 3"]) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
-    """(standard deviations along the principal axes, rotations as quaternions) of covariance matrices."""
+    """Returns (standard deviations along the principal axes, rotations as quaternions) of covariance matrices."""
     squares, axes = torch.linalg.eigh(covariances.double())
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # a rotation, no mirror
     least = squares.amax(1, keepdim=True) * 1e-12
@@ -99,7 +98,7 @@ def principal_axes(covariances: Float[Tensor, "N 3 3"]) -> tuple[Float[Tensor, "
 
 @torch.no_grad()
 def bake(run: Run, zoom: float = 1.0) -> Gaussians:
-    """Gaussians for all views, as training cameras see them at `zoom` times their resolution.
+    """Returns Gaussians for all views, as training cameras see them at `zoom` times their resolution.
 
     Raises:
         InputError: the backbone does not tell its splats apart, or no camera sees any.
@@ -108,17 +107,12 @@ def bake(run: Run, zoom: float = 1.0) -> Gaussians:
     if not isinstance(backbone, Bakeable):
         raise InputError(f"backbone {run.config['backbone']['name']} cannot be baked: its splats have no names")
     sums = Sums.of(backbone.slot_count(), run.device)
-    for camera in asked(run):
-        seen = camera.zoom(zoom)
-        drawn = backbone.draw(seen, run.model_step)
-        sums.add(drawn.splats, *backbone.slots(drawn), seen)
+    cameras = [view.camera for view in run.scene.train]
+    count = min(len(cameras), MOST_CAMERAS)
+    for index in range(count):
+        camera = cameras[index * len(cameras) // count].zoom(zoom)
+        drawn = backbone.draw(camera, run.model_step)
+        sums.add(drawn.splats, *backbone.slots(drawn), camera)
     if not bool((sums.weights > 0).any()):
         raise InputError("no training camera sees any splat of this model: there is nothing to bake")
     return sums.gaussians()
-
-
-def asked(run: Run) -> Sequence[Camera]:
-    """Training cameras, at most MOST_CAMERAS."""
-    cameras = [view.camera for view in run.scene.train]
-    count = min(len(cameras), MOST_CAMERAS)
-    return [cameras[i * len(cameras) // count] for i in range(count)]

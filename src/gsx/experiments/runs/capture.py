@@ -19,7 +19,7 @@ from gsx.experiments.runs.orbit import axes_about, nearest_to_rays
 from gsx.experiments.runs.scene_extent import in_one_place
 
 POINTS = 3000
-"""Looked at, evenly drawn from all."""
+"""Points that are looked up, evenly over all."""
 LOOKED_AT = 400
 """Width of pictures that exposure is read from, px: a point's own colour, not its pixel's."""
 DARK, BRIGHT = 0.02, 0.9
@@ -43,7 +43,7 @@ GAP = 15.0
 
 
 def capture_lines(scene: Scene) -> Iterator[str]:
-    """Lines on sharpness, exposure and coverage, with what to photograph again.
+    """Yields lines on sharpness, exposure and coverage, with what to photograph again.
 
     Raises:
         InputError: a photograph cannot be read.
@@ -63,8 +63,8 @@ def capture_lines(scene: Scene) -> Iterator[str]:
         yield ring_line(views, around)
 
 
-def seen_colours(view: View, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-    """Light where a view shows each point; nan where it is not in view, too dark, too bright, or does not count."""
+def light_at(view: View, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+    """Returns light where a view shows each point; nan: not in view, too dark, too bright, or not counted."""
     image, counted = view.image(), view.counted()
     light = linear_from_display(image)
     brightness = light.mean(0)
@@ -79,12 +79,12 @@ def seen_colours(view: View, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3
 
 
 def exposure(view: View, points: Float[Tensor, "P 3"], colours: Float[Tensor, "P 3"]) -> tuple[float, float]:
-    """(stops by which points are brighter in a view than in the cloud, share of those in view that it shows).
+    """Returns (stops by which points are brighter in a view than in the cloud, share of those in view that it shows).
 
-    A median over points of the right colour and about the right light, found around itself again and again, so that
-    what stands before a point does not enter; NaN where there is none.
+    The stops are a median over points of the right colour and about the right light, found around itself in rounds, so
+    that what stands before a point does not enter; NaN where there is none.
     """
-    light = seen_colours(view, points)
+    light = light_at(view, points)
     stops, own = light.log2(), colours.clamp(min=1e-3).log2()
     hues = (stops - stops.mean(1, keepdim=True) - own + own.mean(1, keepdim=True)).abs().amax(1)
     differences = light.mean(1).log2() - colours.mean(1).clamp(min=1e-3).log2()
@@ -100,8 +100,10 @@ def exposure(view: View, points: Float[Tensor, "P 3"], colours: Float[Tensor, "P
 
 
 def exposures(views: Sequence[View], cloud: PointCloud) -> Float[Tensor, "V"] | None:
-    """Return stops by which each view is brighter than the middle one, by the same points; NaN for a view that shows
-    none of them, None where their colours are not the scene's."""
+    """Returns stops by which each view is brighter than the middle one; NaN for a view that shows no point.
+
+    None: the colours of the points are not the scene's.
+    """
     step = max(1, len(cloud) // POINTS)
     points, colours = cloud.positions[::step], linear_from_display(cloud.colours[::step].float() / 255)
     found = [exposure(view, points, colours) for view in views]
@@ -110,7 +112,7 @@ def exposures(views: Sequence[View], cloud: PointCloud) -> Float[Tensor, "V"] | 
 
 
 def exposure_line(views: Sequence[View], gains: Float[Tensor, "V"]) -> str:
-    """How alike photographs are exposed, and which are not."""
+    """Returns how alike photographs are exposed, and which are not."""
     known = gains[gains.isfinite()]
     spread, rest = float(known.max() - known.min()), len(gains) - len(known)
     odd = sorted((i for i in range(len(views)) if abs(float(gains[i])) > UNEVEN), key=lambda i: -abs(float(gains[i])))
@@ -122,13 +124,13 @@ def exposure_line(views: Sequence[View], gains: Float[Tensor, "V"]) -> str:
     return f"{line}; off by more than a third: {worst}; lock exposure and white balance"
 
 
-def coverage_line(views: Sequence[View], seen: Bool[Tensor, "V P"]) -> str:
-    """How often points are in view, and which photographs share too little with any other."""
-    counts = seen.sum(0)
+def coverage_line(views: Sequence[View], visible: Bool[Tensor, "V P"]) -> str:
+    """Returns how often points are in view, and which photographs share too little with any other."""
+    counts = visible.sum(0)
     rare = float((counts < FEW).float().mean())
     often = f"{int(counts.median())} of {len(views)} photographs"
     line = f"coverage  points are in view of {often}; {rare:.0%} of fewer than {FEW}"
-    alone = [(share, number, other) for number, (share, other) in enumerate(shared(seen)) if share < LEAST_SHARED]
+    alone = [(share, index, other) for index, (share, other) in enumerate(shared(visible)) if share < LEAST_SHARED]
     if not alone:
         return line
     named = ", ".join(f"{views[i].name} ({share:.0%}, with {views[j].name})" for share, i, j in sorted(alone)[:5])
@@ -136,15 +138,15 @@ def coverage_line(views: Sequence[View], seen: Bool[Tensor, "V P"]) -> str:
     return f"{line}; share little of what they see with any other: {named}{more}; photograph in between"
 
 
-def shared(seen: Bool[Tensor, "V P"]) -> list[tuple[float, int]]:
-    """For each view (largest share of its points that another sees, which one); (1, itself) for one without points."""
-    values = seen.float()
+def shared(visible: Bool[Tensor, "V P"]) -> list[tuple[float, int]]:
+    """Returns for each view (largest share of its points that another sees, which one); (1, itself) without points."""
+    values = visible.float()
     shares = values @ values.T / values.sum(1, keepdim=True).clamp(min=1)
     shares.fill_diagonal_(-1)
     best = shares.max(1)
     return [
-        (float(share), int(other)) if bool(own.any()) and len(seen) > 1 else (1.0, number)
-        for number, (share, other, own) in enumerate(zip(best.values, best.indices, seen, strict=True))
+        (float(share), int(other)) if bool(own.any()) and len(visible) > 1 else (1.0, index)
+        for index, (share, other, own) in enumerate(zip(best.values, best.indices, visible, strict=True))
     ]
 
 
@@ -159,7 +161,7 @@ class Ring:
 
 
 def ring(views: Sequence[View]) -> Ring | None:
-    """Where cameras stand around the point nearest to all their axes; None where they do not look at one place."""
+    """Returns how cameras stand around the point nearest to all their axes; None: they look at no one place."""
     cameras = [view.camera for view in views]
     rotations = torch.stack([camera.rotation.double() for camera in cameras])
     centres = torch.stack([camera.centre.double() for camera in cameras])
@@ -179,7 +181,7 @@ def ring(views: Sequence[View]) -> Ring | None:
 
 
 def ring_line(views: Sequence[View], around: Ring) -> str:
-    """From how many degrees the place is seen, and where there is a gap."""
+    """Returns over how many degrees cameras stand, and where there is a gap."""
     open_side, *others = sorted(range(len(around.gaps)), key=lambda i: -around.gaps[i])
     reach = 360 - around.gaps[open_side]
     usual = median(around.gaps)

@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 
 def convert(source: Path, to: Path, axes: str = AUTO, spz: SpzForm = SPZ_FORM, local: bool = False) -> None:
-    """Write the splats of a file as the kind that the other name says, with its mark for compensated opacities.
+    """Writes the splats of a file as the kind that the other name says, with its mark for compensated opacities.
 
     axes: of the file that is read; spz: form of a .spz that is written; local: positions relative to an origin, where
     they are far from (0, 0, 0).

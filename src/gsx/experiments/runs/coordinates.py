@@ -18,14 +18,14 @@ COMMENTED = (STANDARD, ".compressed.ply", ".glb", "")
 
 
 def placement(origin: Origin, local: bool) -> tuple[Origin, list[str]]:
-    """Return (what is added to positions of a file, comments): the origin, or its statement in a `local` file."""
+    """Returns (what is added to positions of a file, comments): the origin, or its statement in a `local` file."""
     if not any(origin):
         return NO_ORIGIN, []
     return (NO_ORIGIN, [comment_of(origin)]) if local else (origin, [])
 
 
 def refuse_too_far(path: Path, gaussians: Gaussians, origin: Origin) -> None:
-    """Raise InputError for SPZ where it cannot hold coordinates, with the remedies that exports have."""
+    """Raises InputError for SPZ where it cannot hold coordinates, with the remedies that exports have."""
     if not any(origin) or suffix_of(path) != ".spz" or not len(gaussians.means):
         return
     furthest = float(away(gaussians, origin).means.abs().max())
@@ -37,7 +37,7 @@ def refuse_too_far(path: Path, gaussians: Gaussians, origin: Origin) -> None:
 
 
 def log_coordinates(path: Path, origin: Origin, local: bool, gaussians: Gaussians | None = None) -> None:
-    """Log in which coordinates the file of a scene far from (0, 0, 0) is, and what that costs."""
+    """Logs in which coordinates the file of a scene far from (0, 0, 0) is, and what that costs."""
     if not any(origin):
         return
     suffix, middle = suffix_of(path), in_words(origin)
@@ -57,5 +57,5 @@ def log_coordinates(path: Path, origin: Origin, local: bool, gaussians: Gaussian
 
 
 def median_scale(gaussians: Gaussians) -> float:
-    """Return the median standard deviation of Gaussians along their axes, scene units."""
+    """Returns the median standard deviation of Gaussians along their axes, scene units."""
     return float(gaussians.log_scales.median().exp()) if len(gaussians.means) else 1.0

@@ -32,6 +32,7 @@ POSE_DIGITS = 6
 
 def environment(run: Run, plugins: Plugins, idle: Collection[str]) -> dict[str, Any]:
     """Returns machine, versions and the rescaled schedule for environment.json; `idle`: keys that change no result."""
+    scene = run.scene
     return {
         "gsx": __version__,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
@@ -47,22 +48,22 @@ def environment(run: Run, plugins: Plugins, idle: Collection[str]) -> dict[str, 
         "plugins": plugins.versions,
         "options": composition_key(run.config, "", idle),
         "plan": plan_of(run),
-        "training_focal": max(view.camera.focal for view in run.scene.train),
+        "training_focal": max(view.camera.focal for view in scene.train),
         "scene": {
             "stamp": scene_stamp(run.config),
-            "cameras": camera_digest([*run.scene.train, *run.scene.test]),
-            "train_views": len(run.scene.train),
-            "test_views": len(run.scene.test),
-            "points": len(run.scene.points),
-            "extent": run.scene.extent,
-            "origin": list(run.scene.origin),
-            "notes": list(run.scene.notes),
+            "cameras": camera_digest([*scene.train, *scene.test]),
+            "train_views": len(scene.train),
+            "test_views": len(scene.test),
+            "points": len(scene.points),
+            "extent": scene.extent,
+            "origin": list(scene.origin),
+            "notes": list(scene.notes),
         },
     }
 
 
 def camera_digest(views: Sequence[View]) -> str:
-    """Of names, sizes, intrinsics and poses of views, in order."""
+    """Returns a digest of names, sizes, intrinsics and poses of views, in order."""
     content = hashlib.sha256(repr([(view.name, view.camera.size) for view in views]).encode())
     cameras = [view.camera for view in views]
     numbers = [torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float64)]
@@ -75,7 +76,7 @@ def camera_digest(views: Sequence[View]) -> str:
 
 
 def installed_version(package: str) -> str:
-    """Version of an installed distribution."""
+    """Returns the version of an installed distribution."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -83,7 +84,7 @@ def installed_version(package: str) -> str:
 
 
 def announce(run: Run, plugins: Plugins) -> None:
-    """Say what is about to be trained, and by which schedule."""
+    """Logs what is about to be trained, and by which schedule."""
     scene = run.scene
     (width, height), points = scene.train[0].camera.size, f"{len(scene.points):,}"
     views = f"{len(scene.train)} training and {len(scene.test)} test views of {width}x{height} px"
@@ -93,8 +94,8 @@ def announce(run: Run, plugins: Plugins) -> None:
     for failure in plugins.failures:
         logger.warning("plugin %s did not load: %s", failure.plugin, failure.reason)
     for name, part in plan_of(run).items():
-        told = {key: value for key, value in part.items() if key != CAUTION}
-        logger.info("plan of %s: %s", name, ", ".join(f"{key} {in_words(value)}" for key, value in told.items()))
+        entries = [f"{key} {in_words(value)}" for key, value in part.items() if key != CAUTION]
+        logger.info("plan of %s: %s", name, ", ".join(entries))
         if CAUTION in part:
             logger.warning("%s %s", name, part[CAUTION])
     logger.info(
@@ -103,7 +104,7 @@ def announce(run: Run, plugins: Plugins) -> None:
 
 
 def in_words(value: object) -> str:
-    """A number of the plan, or several, or whatever else a plugin tells."""
+    """Returns a number of the plan, or several, or whatever else a plugin plans, in words."""
     if isinstance(value, list | tuple):
         return " ".join(map(in_words, value)) or "none"
     return f"{value:.6g}" if isinstance(value, int | float) else str(value)

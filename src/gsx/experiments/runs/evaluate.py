@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 @relieve_oversubscription()
 def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
-    """Write evaluation.json and the pictures of a run."""
+    """Writes evaluation.json and the pictures of a run."""
     options, begun = settings.evaluation, time.perf_counter()
     evaluator, pictures = Evaluator(run, options), Pictures(run.folder / "renders", run.step)
     if run.scene.test:
@@ -45,7 +45,7 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
 
 
 def embellish(run: Run, pictures: Pictures, options: EvalOptions) -> None:
-    """Depth and a flight for the report; if they cannot be drawn, what was measured is kept all the same.
+    """Draws depth and a flight for the report; figures are kept if that fails.
 
     Raises:
         InputError: they cannot be written, which is so of all that a run has to leave.
@@ -59,7 +59,7 @@ def embellish(run: Run, pictures: Pictures, options: EvalOptions) -> None:
 
 
 def tell_of_paths(before: dict[str, Any], now: dict[str, Any]) -> None:
-    """Say so if another path of the rasterizer has drawn what was timed in an earlier evaluation."""
+    """Warns if another path of the rasterizer has drawn what was timed in an earlier evaluation."""
     path = before.get("render_path")
     if path and path != now["render_path"] and before.get("render_fps"):
         logger.warning(
@@ -69,7 +69,7 @@ def tell_of_paths(before: dict[str, Any], now: dict[str, Any]) -> None:
 
 
 def summary(evaluation: dict[str, Any]) -> list[str]:
-    """Return the result in a few lines."""
+    """Returns the result in a few lines."""
     e = evaluation
     memory = "n/a" if e["peak_memory_mb"] is None else f"{e['peak_memory_mb']:,.0f} MB"
     speed = "" if e["render_fps"] is None else f"{e['render_fps']:.1f} renders/s ({e['render_path']}), "
@@ -84,14 +84,14 @@ def summary(evaluation: dict[str, Any]) -> list[str]:
 
 
 def quality(evaluation: dict[str, Any]) -> str:
-    """Return the mean figures of test views in words."""
+    """Returns the mean figures of test views in words."""
     e = evaluation
     lpips = "n/a (no weights)" if e["lpips"] is None else f"{e['lpips']:.4f}"
     return f"held-out PSNR {e['psnr']:.2f} dB, SSIM ({e['protocol']['ssim']}) {e['ssim']:.4f}, LPIPS {lpips}"
 
 
 def remedies(run: Run, evaluation: dict[str, Any], remedy: str) -> list[str]:
-    """What to try where a render zoomed in loses to the enlarged one, and is not yet compensated for dilation."""
+    """Returns what to try where a zoomed render loses to the enlarged one, and no filter compensates for dilation."""
     lost = [
         factor for factor, e in evaluation["zoom"].items() if float(factor) > 1 and e.get("beats_enlarged") is False
     ]
@@ -101,7 +101,7 @@ def remedies(run: Run, evaluation: dict[str, Any], remedy: str) -> list[str]:
 
 
 def zoom_line(factor: str, result: dict[str, Any]) -> str:
-    """One zoom figure with its verdict."""
+    """Returns one zoom figure with its verdict."""
     if "unavailable" in result:
         return f"zoom x{factor}: n/a, {result['unavailable']}"
     if factor == "1":

@@ -1,4 +1,4 @@
-"""Train from the current step on, evaluate, export, report."""
+"""Trains from the current step on, evaluates, exports, reports."""
 
 import logging
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from gsx.core.errors import CompilerError, LostModel, TrainingError, first_line
+from gsx.core.errors import CompilerError, LostModel, first_line
 from gsx.core.files import read_json, remove_partial, write_json
 from gsx.core.plugins import Plugins, hookimpl
 from gsx.core.training import checkpoint
@@ -24,28 +24,28 @@ from gsx.experiments.runs.export import export
 from gsx.experiments.runs.progress import MetricsLog, Progress
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.settings import Settings
-from gsx.experiments.runs.tracking import build_trackers, telling_of_failure
+from gsx.experiments.runs.tracking import announce_failure, build_trackers, reason_of
 
 logger = logging.getLogger(__name__)
 
 
 class Checkpointer:
-    """Listener: saves every `training.checkpoint_every` steps and when training ends, complete or not."""
+    """Listener that saves every `training.checkpoint_every` steps, and when training ends, complete or not."""
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
-        """Save when due."""
+        """Saves when due."""
         if run.step % run.training.checkpoint_every == 0 and not run.complete:
             checkpoint.save(run)
 
     @hookimpl
     def gsx_training_finished(self, run: Run) -> None:
-        """Save the last state."""
+        """Saves the last state."""
         checkpoint.save(run)
 
 
 def status(run: Run, state: str, reason: str = "") -> None:
-    """Record how the run stands, for reports over many runs."""
+    """Records the state of a run for reports over many."""
     write_json(run.folder / "status.json", {"state": state, "reason": reason, "step": run.step})
 
 
@@ -62,17 +62,9 @@ def execute(run: Run, settings: Settings, plugins: Plugins, keep_states: bool = 
     remove_partial(cache_root())
     announce(run, plugins)
     status(run, "running")
-    log = MetricsLog(settings.evaluation)
-    listeners: list[object] = [
-        Guard(),
-        Agreement(),
-        CapNotice(),
-        log,
-        *trackers,
-        Checkpointer(),
-        Progress(),
-    ]  # trackers read the log
-    general = settings.general
+    general, log = settings.general, MetricsLog(settings.evaluation)
+    first = [Guard(), Agreement(), CapNotice(), log]  # trackers read the log
+    listeners: list[object] = [*first, *trackers, Checkpointer(), Progress()]
     if keep_states and general.init == "warm_start":
         states = warm_start.warm_start_folder(run, settings.idle, plugins.versions)
         listeners.append(warm_start.WarmStartKeeper(states, general.disk_cache_gb, general.warm_start_at))
@@ -81,7 +73,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins, keep_states: bool = 
         with (
             viewed(run, settings) as viewers,
             plugins.listening([*listeners, *viewers]),
-            telling_of_failure(run, plugins),
+            announce_failure(run, plugins),
         ):
             train(run, plugins)
             if run.complete:
@@ -98,8 +90,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins, keep_states: bool = 
 
 
 def warm_or_eager(run: Run, settings: Settings) -> None:
-    """Have compiled what steps need; where that fails at the beginning of a run that left the path to gsx, it goes
-    eagerly.
+    """Compiles what steps need; where that fails at the beginning of a run with path=auto, it goes eagerly.
 
     Raises:
         CompilerError: elsewhere.
@@ -107,8 +98,8 @@ def warm_or_eager(run: Run, settings: Settings) -> None:
     try:
         warm(run, settings)
     except CompilerError as error:
-        left_to_gsx = settings.raster.path == "auto" and run.raster.path == "compiled"
-        if not left_to_gsx or run.step > 0 or run.ranks.size > 1:
+        chosen_by_gsx = settings.raster.path == "auto" and run.raster.path == "compiled"
+        if not chosen_by_gsx or run.step > 0 or run.ranks.size > 1:
             raise
         logger.warning("%s; going on with the eager path, which is several times slower", error)
         run.raster = run.backbone.raster = replace(run.raster, path="eager")
@@ -118,7 +109,7 @@ def warm_or_eager(run: Run, settings: Settings) -> None:
 
 @contextmanager
 def viewed(run: Run, settings: Settings) -> Iterator[list[object]]:
-    """The listener that shows the model in a browser, where that is asked for; its address is told.
+    """Yields the listener that shows the model in a browser, with `viewer=true`, and logs its address.
 
     Raises:
         ConfigError, InputError: viser is not installed, or nothing can listen there.
@@ -129,32 +120,28 @@ def viewed(run: Run, settings: Settings) -> Iterator[list[object]]:
         return
     from gsx.experiments.viewer.training import TrainingViewer
 
-    shown = TrainingViewer(run, general.viewer_host, general.viewer_port, general.viewer_share)
-    logger.info("look around: %s", shown.viewer.address)
+    viewer = TrainingViewer(run, general.viewer_host, general.viewer_port, general.viewer_share)
+    logger.info("look around: %s", viewer.viewer.address)
     try:
-        yield [shown]
+        yield [viewer]
     finally:
-        shown.stop()
+        viewer.stop()
 
 
 def save_on_failure(run: Run, error: BaseException) -> None:
-    """After an error: a checkpoint of the last step, where the model is that of a step, and a word on what happened.
-
-    What cannot be written now is told in the log; the error itself is what matters.
-    """
+    """Writes a checkpoint of the last step after an error, where the model is that of a step, and the reason."""
     kept = run.step in map(checkpoint.step_of, checkpoint.sidecars(run.folder / "checkpoints"))
     nothing = run.step == 0 and not isinstance(error, KeyboardInterrupt | CompilerError)  # who says how to go on
-    reason = str(error) if isinstance(error, TrainingError) else f"{type(error).__name__}: {error}"
-    with told_of(f"the checkpoint of step {run.step}"):
+    with problems_logged(f"the checkpoint of step {run.step}"):
         if not (kept or nothing or run.changing or isinstance(error, LostModel)):
             checkpoint.save(run)
-    with told_of("its status"):
-        status(run, "failed", reason)
+    with problems_logged("its status"):
+        status(run, "failed", reason_of(error))
 
 
 @contextmanager
-def told_of(what: str) -> Iterator[None]:
-    """What cannot be written after an error, for want of space or memory, must not hide it."""
+def problems_logged(what: str) -> Iterator[None]:
+    """Logs what cannot be written after an error, for want of space or memory, and does not hide that error."""
     try:
         yield
     except Exception as problem:
@@ -162,14 +149,14 @@ def told_of(what: str) -> Iterator[None]:
 
 
 def follow(run: Run, settings: Settings, plugins: Plugins) -> None:
-    """Train as another process does, and write nothing."""
+    """Trains as the first process does, and writes nothing."""
     warm(run, settings, helped=False)
     with plugins.listening([Guard(), Agreement()]):
         train(run, plugins)
 
 
 def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:
-    """Evaluate, export, draw and report a trained run."""
+    """Evaluates, exports, draws and reports a trained run."""
     evaluation = evaluate(run, settings)
     plugins.emit.gsx_evaluated(run=run, evaluation=evaluation)
     export(run, run.folder / SPLATS)

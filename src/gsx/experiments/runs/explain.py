@@ -1,5 +1,4 @@
-"""What a key of the configuration is: its value, where that comes from, what is written beside it there, and what else
-it may be."""
+"""What a key of the configuration is: its value, what it may be, which files set it, and what they say of it."""
 
 import re
 import types
@@ -21,6 +20,10 @@ from gsx.experiments.runs.typed import dotted, right_key
 KINDS = {int: "whole number", float: "number", str: "text", bool: "true or false", Path: "path"}
 WIDTH = 110
 """Characters of a comment where it shares a line with a key or an option."""
+SEVERAL = {"augmenter": "augmenter", "tracker": "tracker", "module": "training"}
+"""Where options lie of groups of which several are chosen."""
+LISTED = ("scene", "backbone", *SEVERAL, "regenerator/upscale", "regenerator/restore", "rasterizer")
+"""Groups whose options have keys of their own; presets and variants set those of others."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,6 @@ class Parsed:
 
     source: Source
     text: str
-    lines: list[str]
     node: yaml.Node | None
     """None: it holds nothing."""
 
@@ -46,10 +48,10 @@ class Entry:
 
 
 def explain(key: str, overrides: Sequence[str], plugins: Plugins) -> list[str]:
-    """Lines on a key, a group or an option of one (`backbone=scaffold`), in a composition.
+    """Returns lines on a key, a group or an option of one (`backbone=scaffold`), in a composition.
 
     Raises:
-        ConfigError: there is no such key; the nearest is told.
+        ConfigError: there is no such key; the nearest is named.
     """
     group, _, option = key.partition("=")
     with Compositions(plugins) as compositions:
@@ -61,39 +63,26 @@ def explain(key: str, overrides: Sequence[str], plugins: Plugins) -> list[str]:
             raise ConfigError(f"'{key}' is no configuration key.{right_key(key, known)} `gsx --cfg job` lists all keys")
         settings, files = compositions.settings(overrides), parsed(compositions.sources(overrides))
         dotted_key = key.replace("/", ".")  # where what a nested group holds is
-        lines = [headline(key, values), *indented(kind_of(key, settings))]
-        lines += indented(
-            *(f"command line  {word.partition('=')[2]}" for word in overrides if word.startswith(f"{key}="))
-        )
-        lines += indented(*(line for entry in reversed(entries(files, dotted_key)) for line in told(entry)))
+        value = value_at(key, values)
+        typed = [word.partition("=")[2] for word in overrides if word.startswith(f"{key}=")]
+        details = [kind_of(key, settings), *(f"command line  {word}" for word in typed)]
+        details += [line for entry in reversed(entries(files, dotted_key)) for line in lines_of(entry)]
+        lines = [key if value is MISSING or isinstance(value, dict) else f"{key} = {written(value)}"]
+        lines += [f"  {detail}" for detail in details if detail]
         if key in groups:
             lines += ["", f"{key}=NAME, one of (* chosen)", *options_of(key, compositions, files)]
         return lines + below(dotted_key, values, files)
 
 
-def indented(*texts: str) -> list[str]:
-    """Those that are not empty, below a headline."""
-    return [f"  {text}" for text in texts if text]
-
-
 def options_of(group: str, compositions: Compositions, files: Sequence[Parsed]) -> list[str]:
-    """Options of a group, a line each; those of the composition are marked."""
+    """Returns a line for each option of a group; those of the composition are marked."""
     chosen = {file.source.file for file in files}
-    lines = []
-    for name in listed(group):
-        file = compositions.file(f"{group}/{name}")
-        lines.append(f"{'*' if file in chosen else ' '} {name:24} {head_of(file)}".rstrip())
-    return lines
-
-
-def headline(key: str, node: dict[str, Any]) -> str:
-    """The key and its value."""
-    value = value_at(key, node)
-    return key if value is MISSING or isinstance(value, dict) else f"{key} = {written(value)}"
+    places = {name: compositions.file(f"{group}/{name}") for name in listed(group)}
+    return [f"{'*' if file in chosen else ' '} {name:24} {head_of(file)}".rstrip() for name, file in places.items()]
 
 
 def value_at(key: str, node: Any) -> Any:
-    """What a dotted key stands for; MISSING: nothing."""
+    """Returns the value of a dotted key; MISSING: there is none."""
     for part in key.split("."):
         if not isinstance(node, dict) or part not in node:
             return MISSING
@@ -102,46 +91,46 @@ def value_at(key: str, node: Any) -> Any:
 
 
 def written(value: Any) -> str:
-    """A value as the command line has it."""
+    """Returns a value as the command line has it."""
     text = yaml.safe_dump(value, default_flow_style=True, width=1 << 20, allow_unicode=True)
     return text.removesuffix("\n...\n").strip()
 
 
-def told(entry: Entry) -> list[str]:
-    """An entry in lines."""
+def lines_of(entry: Entry) -> list[str]:
+    """Returns an entry in lines."""
     first = f"{entry.place}  {entry.value}".rstrip()
-    return [first, *(f"    {line}" for line in [entry.comment] if line)]
+    return [first, f"    {entry.comment}"] if entry.comment else [first]
 
 
-def below(key: str, node: dict[str, Any], sources: Sequence[Parsed]) -> list[str]:
-    """The keys below a key, a line each: value, and what the file says that sets it."""
+def below(key: str, node: dict[str, Any], files: Sequence[Parsed]) -> list[str]:
+    """Returns a line for each key below a key: value, and the comment of the file that sets it."""
     inner = value_at(key, node)
-    if not isinstance(inner, dict) or not inner:
-        return []
-    lines = ["", f"below {key}:"]
+    lines = []
     for name in dotted(inner):
         value = value_at(name, inner)
         if not isinstance(value, dict):
-            found = entries(sources, f"{key}.{name}")
-            comment = next((entry.comment for entry in reversed(found) if entry.comment), "")
-            lines.append(f"  {f'{name}: {written(value)}':34} {comment[:WIDTH]}".rstrip())
-    return lines
+            comment = comment_on(f"{key}.{name}", files)[:WIDTH]
+            lines.append(f"  {f'{name}: {written(value)}':34} {comment}".rstrip())
+    return ["", f"below {key}:", *lines] if lines else []
 
 
 # -- files ---------------------------------------------------------------------------------------------------------
 
 
 def parsed(sources: Sequence[Source]) -> list[Parsed]:
-    """Files of a composition, read."""
+    """Returns the files of a composition, parsed."""
     texts = [source.file.read_text(encoding="utf-8") for source in sources]
-    return [
-        Parsed(source, text, text.splitlines(), yaml.compose(text, Loader=yaml.SafeLoader))
-        for source, text in zip(sources, texts, strict=True)
-    ]
+    nodes = [yaml.compose(text, Loader=yaml.SafeLoader) for text in texts]
+    return [Parsed(source, text, node) for source, text, node in zip(sources, texts, nodes, strict=True)]
+
+
+def comment_on(key: str, files: Sequence[Parsed]) -> str:
+    """Returns the comment of the last file that has one on a key, or an empty text."""
+    return next((entry.comment for entry in reversed(entries(files, key)) if entry.comment), "")
 
 
 def entries(files: Sequence[Parsed], key: str) -> list[Entry]:
-    """Where a key is set, in the order in which files take the place of one another."""
+    """Returns where a key is set, in the order in which files take the place of one another."""
     found, parts = [], key.split(".")
     for file in files:
         package = file.source.package.split(".") if file.source.package else []
@@ -151,31 +140,24 @@ def entries(files: Sequence[Parsed], key: str) -> list[Entry]:
 
 
 def entry_in(file: Parsed, parts: Sequence[str]) -> Entry | None:
-    """A key in one file; None: it is not set there."""
+    """Returns a key in one file; None: it is not set there."""
     name, node = None, file.node
     for part in parts:
         pairs = node.value if isinstance(node, yaml.MappingNode) else []
         name, node = next(((name, value) for name, value in pairs if name.value == part), (None, None))
-        if name is None or node is None:
-            return None
-    assert name is not None
-    assert node is not None
-    line, begin, end = name.start_mark.line, node.start_mark, node.end_mark
+    if name is None or node is None:
+        return None
+    lines, line, begin, end = file.text.splitlines(), name.start_mark.line, node.start_mark, node.end_mark
     inner = isinstance(node, yaml.MappingNode) and not node.flow_style
-    rest = file.lines[line][name.end_mark.column if inner or end.line != line else end.column :]
-    comment = " ".join([*above(file.lines, line, name.start_mark.column), *after_hash(rest)])
+    rest = lines[line][name.end_mark.column if inner or end.line != line else end.column :]
+    after = rest.partition(" #")[2].strip()
+    comment = " ".join([*above(lines, line, name.start_mark.column), *([after] if after else [])])
     value = "" if inner else " ".join(file.text[begin.index : end.index].split())
     return Entry(place=f"{file.source.name}:{line + 1}", value=value, comment=comment)
 
 
-def after_hash(text: str) -> list[str]:
-    """The comment at the end of a line."""
-    _, hash_, comment = text.partition(" #")
-    return [comment.strip()] if hash_ else []
-
-
 def above(lines: Sequence[str], line: int, column: int) -> list[str]:
-    """Comments above a key, but for those at the head of a file, which are about all of it."""
+    """Returns the comments above a key, but for those at the head of a file, which are about all of it."""
     first = line
     while first > 0 and lines[first - 1].startswith(" " * column + "#"):
         first -= 1
@@ -183,7 +165,7 @@ def above(lines: Sequence[str], line: int, column: int) -> list[str]:
 
 
 def head_of(file: Path) -> str:
-    """The first sentence of the comment that a file begins with."""
+    """Returns the first sentence of the comment that a file begins with."""
     words = []
     for line in file.read_text(encoding="utf-8").splitlines() if file.is_file() else []:
         if not line.startswith("#"):
@@ -196,7 +178,7 @@ def head_of(file: Path) -> str:
 
 
 def kind_of(key: str, settings: Settings) -> str:
-    """What a value may be, in words; empty where the options of its component do not say."""
+    """Returns what a value may be, in words; empty where the options of its component do not say."""
     for prefix, schema in sorted(schemas(settings).items(), reverse=True):  # those below others first
         if key.startswith(prefix):
             return kind_in(schema, key.removeprefix(prefix).split("."))
@@ -204,7 +186,7 @@ def kind_of(key: str, settings: Settings) -> str:
 
 
 def schemas(settings: Settings) -> dict[str, type]:
-    """Dataclasses of options by the beginning of their keys; general options have none."""
+    """Returns dataclasses of options by the beginning of their keys; general options have none."""
     single = {"training": settings.training, "eval": settings.evaluation, "rasterizer": settings.raster}
     chosen = {"scene": settings.scene, "backbone": settings.backbone}
     chosen |= {f"training.{name}": one for name, one in settings.modules.items()}
@@ -217,7 +199,7 @@ def schemas(settings: Settings) -> dict[str, type]:
 
 
 def kind_in(schema: type, parts: Sequence[str]) -> str:
-    """What a field of a dataclass may hold, in words."""
+    """Returns what a field of a dataclass may hold, in words."""
     hints = get_type_hints(schema, include_extras=True)
     if parts[0] not in hints:
         return ""
@@ -230,7 +212,7 @@ def kind_in(schema: type, parts: Sequence[str]) -> str:
 
 
 def in_words(hint: Any) -> str:
-    """A type in words; empty: one that has none."""
+    """Returns a type in words; empty: one that has none."""
     origin, inner = get_origin(hint), list(get_args(hint))
     if origin in (Union, types.UnionType):
         words = [in_words(part) for part in inner if part is not type(None)]
@@ -246,7 +228,7 @@ def in_words(hint: Any) -> str:
 
 
 def reference(plugins: Plugins) -> list[str]:
-    """A page over all keys, in Markdown: of a run, then of each option of each group."""
+    """Returns a page over all keys, in Markdown: of a run, then of each option of each group."""
     lines = [
         "# Configuration",
         "",
@@ -265,33 +247,26 @@ def reference(plugins: Plugins) -> list[str]:
     return [*lines, ""]
 
 
-SEVERAL = {"augmenter": "augmenter", "tracker": "tracker", "module": "training"}
-"""Where options lie of groups of which several are chosen."""
-LISTED = ("scene", "backbone", *SEVERAL, "regenerator/upscale", "regenerator/restore", "rasterizer")
-"""Groups whose options have keys of their own; presets and variants set those of others."""
-
-
 def keys_table(prefix: str, words: Sequence[str], compositions: Compositions, groups: Sequence[str]) -> list[str]:
-    """The keys below a prefix, a row each; those of a run where there is none, but not those that groups bring."""
+    """Returns a row for each key below a prefix; without one, for those of a run that no group brings."""
     values = compositions.values(words)
     try:
         settings = compositions.settings(words)
-    except ConfigError:  # an option that cannot be used before it is told more, a model for example
+    except ConfigError:  # an option that needs more, a model for example
         settings = None
     files = parsed(compositions.sources(words))
-    brought = tuple(f"{group.partition('/')[0]}." for group in groups)
+    of_groups = tuple(f"{group.partition('/')[0]}." for group in groups)
     rows = ["| key | value | may be | |", "|---|---|---|---|"]
     for key in dotted(values):
         node = value_at(key, values)
-        wanted = key.startswith(f"{prefix}.") if prefix else not key.startswith(brought)
-        if wanted and not isinstance(node, dict):
-            found = entries(files, key)
-            comment = next((entry.comment for entry in reversed(found) if entry.comment), "")
-            cells = (f"`{key}`", f"`{written(node)}`", kind_of(key, settings) if settings else "", comment)
+        belongs = key.startswith(f"{prefix}.") if prefix else not key.startswith(of_groups)
+        if belongs and not isinstance(node, dict):
+            kind = kind_of(key, settings) if settings else ""
+            cells = (f"`{key}`", f"`{written(node)}`", kind, comment_on(key, files))
             rows.append("| " + " | ".join(map(in_cell, cells)) + " |")
     return rows
 
 
 def in_cell(text: str) -> str:
-    """A text in a cell of a table, its marks shown as they are."""
+    """Returns a text for a cell of a table, with its marks escaped."""
     return re.sub(r"([|*])", r"\\\1", text) if "`" in text else re.sub(r"([|*_<>])", r"\\\1", text)

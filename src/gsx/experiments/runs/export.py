@@ -60,7 +60,7 @@ class Exported:
 def export(
     run: Run, path: Path, camera: Camera | None = None, spz: SpzForm = SPZ_FORM, zoom: float = 0, local: bool = False
 ) -> Exported | None:
-    """Write the backbone's own splat file, or a standard one, or a page; returns what a standard one holds.
+    """Writes the backbone's own splat file, or a standard one, or a page; returns what a standard one holds.
 
     camera: what is drawn for it alone. Without one a model that has no standard form is baked where the file is to hold
     one; `zoom` above 0: baked in any case, as cameras see it at so many times their resolution. local: positions
@@ -93,19 +93,19 @@ def export(
 
 
 def log_axes_written(path: Path, spz: SpzForm) -> None:
-    """Log the axes of a file whose reader may take it for others."""
+    """Logs the axes of a file whose reader may take it for others."""
     if suffix_of(path) == ".spz":
         states = "which it states" if spz.version > 3 else "which version 3 cannot state"
         logger.info("%s: SPZ version %d, axes %s, %s", path, spz.version, spz.axes, states)
 
 
 def read_again(path: Path, spz: SpzForm = SPZ_FORM, origin: Origin = NO_ORIGIN) -> Gaussians:
-    """Read a file that was written here, relative to an origin."""
+    """Reads a file that was written here, relative to an origin."""
     return around(read_splats(path, spz.axes if suffix_of(path) == ".spz" else AUTO).gaussians, origin)
 
 
 def explicit_of(run: Run, camera: Camera | None) -> Gaussians | None:
-    """The splats that a backbone has as they are; None: none that hold for all cameras, but some can be baked.
+    """Returns the splats of a backbone as they are; None: none hold for all cameras, but some can be baked.
 
     Raises:
         GsxError: neither.
@@ -119,35 +119,35 @@ def explicit_of(run: Run, camera: Camera | None) -> Gaussians | None:
 
 
 def own_columns(run: Run) -> dict[str, Float[Tensor, "N"]] | None:
-    """Columns of the file that the published code of the backbone writes; None: the standard ones."""
+    """Returns columns of the file that the published code of the backbone writes; None: the standard ones."""
     return run.backbone.file_columns() if isinstance(run.backbone, WithOwnFile) else None
 
 
 def is_page(path: Path) -> bool:
-    """Whether a name is that of a page."""
+    """Returns whether a name is that of a page."""
     return path.suffix.lower() == PAGE
 
 
 def refuse_export(path: Path) -> None:
-    """Raise InputError if the name promises a format that is not written."""
+    """Raises InputError if the name promises a format that is not written."""
     if not is_page(path):
         refuse_suffix(path, (PAGE,))
 
 
 def page_of(run: Run, gaussians: Gaussians, comments: Sequence[str]) -> str:
-    """Return a page that starts at the first test view, or training view where none is held out."""
+    """Returns a page that starts at the first test view, or training view where none is held out."""
     up = upright(torch.stack([view.camera.rotation for view in run.scene.train]).double())
     views, background = shown_views(run.scene)[:PAGE_VIEWS], run.scene.background.tolist()
     return viewer_page(gaussians, views, up, background, f"{run.scene.name}, gsx", comments)
 
 
 def shown_views(scene: Scene) -> Sequence[View]:
-    """Return the test views of a scene, or its training views where none is held out."""
+    """Returns the test views of a scene, or its training views where none is held out."""
     return scene.test or scene.train
 
 
 def notes(run: Run) -> list[str]:
-    """What a viewer must know of the model."""
+    """Returns what a viewer must know of the model."""
     own = run.backbone if isinstance(run.backbone, WithOwnFile) else None
     return [
         f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
@@ -161,7 +161,7 @@ def notes(run: Run) -> list[str]:
 
 
 def zoomed_note(raster: RasterSettings) -> list[str]:
-    """How cameras draw that are k times as fine as those of training, where they do not as those."""
+    """Returns how cameras k times as fine as those of training draw, where they differ."""
     finer = f"at k times the focal length of {raster.training_focal:.6g} px: dilation"
     if raster.zoomed == "magnified":
         return [f"{finer} {raster.dilation} k^2 px^2 for k > 1"]
@@ -172,14 +172,14 @@ def zoomed_note(raster: RasterSettings) -> list[str]:
 
 
 def supersampling_note(run: Run) -> list[str]:
-    """How training saw the model, where that was through finer pixels."""
+    """Returns through which finer pixels the model was trained, if any."""
     times = run.views.supersample_at(run.model_step)
     filter_ = run.scene.reduction.filter
     return [f"trained through renders {times} times as fine, reduced by the {filter_} filter"] if times > 1 else []
 
 
 def render_mode(raster: RasterSettings) -> str:
-    """What viewers are to do about their screen dilation: `mip` compensates opacities for it, `default` does not.
+    """Returns how viewers treat their screen dilation: `mip` compensates opacities for it, `default` does not.
 
     Values of the comment SplatRenderMode, which Brush writes and SuperSplat reads.
     """
@@ -196,7 +196,7 @@ def losses(
     spz: SpzForm = SPZ_FORM,
     local: bool = False,
 ) -> list[str]:
-    """What a standard file, read again, and baking have lost, in PSNR of renders of some views; in words."""
+    """Returns what a standard file, read again, and baking have lost, in PSNR of renders of some views."""
     views, inside = views[:LOOKED_AT], written.gaussians
     stated = local and suffix_of(path) in COMMENTED
     origin = NO_ORIGIN if local and not stated else run.scene.origin
@@ -221,10 +221,10 @@ def losses(
 
 
 def mean_psnr(pictures: Sequence[Float[Tensor, "3 H W"]], others: Sequence[Float[Tensor, "3 H W"]]) -> float:
-    """Mean over pairs."""
+    """Returns the mean PSNR over pairs."""
     return fmean(psnr(a, b) for a, b in zip(pictures, others, strict=True))
 
 
 def as_in_page(gaussians: Gaussians) -> Gaussians:
-    """As a page holds them, but not turned."""
+    """Returns Gaussians as a page holds them, but not turned."""
     return gaussians_from(decode_compressed_ply(encode_compressed_ply(arrays_of(gaussians), ())))

@@ -63,7 +63,7 @@ class Fit:
 
 
 def in_axes_of(scene: Scene, content: SplatContent | None) -> Gaussians | None:
-    """Return the Gaussians of a file, if there is one, in the axes that fit the scene where the file leaves them open.
+    """Returns the Gaussians of a file, if there is one, in the axes that fit the scene where the file leaves them open.
 
     Which axes are taken, why, and how to choose others go to the log.
     """
@@ -91,7 +91,7 @@ def in_axes_of(scene: Scene, content: SplatContent | None) -> Gaussians | None:
 def start_in_scene(
     settings: Settings, scene: Scene, content: SplatContent | None
 ) -> tuple[Gaussians | None, list[str]]:
-    """Return the Gaussians of the file that a run begins with, as they lie in its scene, and doubts about them.
+    """Returns the Gaussians of the file that a run begins with, as they lie in its scene, and doubts about them.
 
     Raises:
         InputError: no splat is in view.
@@ -102,7 +102,7 @@ def start_in_scene(
 
 
 def fit(gaussians: Gaussians, scene: Scene) -> Fit:
-    """Return how Gaussians of a file lie in a scene."""
+    """Returns how Gaussians of a file lie in a scene."""
     some = Gaussians(**{name: spread(value, MOST_SPLATS) for name, value in vars(gaussians).items()})
     some = around(some, origin_of_file(some, scene))
     views = [*scene.train, *scene.test]
@@ -114,7 +114,7 @@ def fit(gaussians: Gaussians, scene: Scene) -> Fit:
 
 
 def better(fits: dict[str, Fit]) -> str | None:
-    """Return the axes of the better of two fits; None: undecided.
+    """Returns the axes of the better of two fits; None: undecided.
 
     Points decide where they are clearly nearer; else the share in view does, which a scene on a table top that is
     turned over may leave as it was.
@@ -130,12 +130,12 @@ def better(fits: dict[str, Fit]) -> str | None:
 
 
 def in_view(fits: dict[str, Fit]) -> bool:
-    """Return whether splats are in view in some axes."""
+    """Returns whether splats are in view in some axes."""
     return max(fit.in_view for fit in fits.values()) >= LEAST_IN_VIEW
 
 
 def likeness(gaussians: Gaussians, scene: Scene) -> float:
-    """Return the mean PSNR of thumbnails of a file's Gaussians against those of photos, dB."""
+    """Returns the mean PSNR of thumbnails of a file's Gaussians against those of photos, dB."""
     gaussians = around(gaussians, origin_of_file(gaussians, scene))
     views = [*scene.train, *scene.test]
     return fmean(
@@ -144,14 +144,14 @@ def likeness(gaussians: Gaussians, scene: Scene) -> float:
 
 
 def thumbnail_psnr(gaussians: Gaussians, view: View, background: Float[Tensor, "3"]) -> float:
-    """Return the PSNR of a small render against a small photo, dB."""
+    """Returns the PSNR of a small render against a small photo, dB."""
     camera = view.camera.zoom(min(1.0, THUMBNAIL / max(view.camera.size)))
     photo = torch.nn.functional.interpolate(view.image()[None], size=(camera.height, camera.width), mode="area")[0]
     return psnr(render_gaussians(gaussians, camera, RasterSettings(path="eager"), background), photo)
 
 
 def more_alike(fits: dict[str, Fit]) -> str | None:
-    """Return the axes of the fit whose thumbnails are clearly more like photos; None: undecided."""
+    """Returns the axes of the fit whose thumbnails are clearly more like photos; None: undecided."""
     (first, a), (second, b) = fits.items()
     if abs(a.likeness - b.likeness) < MORE_ALIKE:
         return None
@@ -159,7 +159,7 @@ def more_alike(fits: dict[str, Fit]) -> str | None:
 
 
 def log_choice(content: SplatContent, fits: dict[str, Fit], best: str | None) -> None:
-    """Log the axes of a file that states none, and the evidence."""
+    """Logs the axes of a file that states none, and the evidence."""
     evidence = "; ".join(f"{axes}: {fit}" for axes, fit in fits.items())
     if best:
         message = "%s: axes %s, which fit the scene (%s); the file states none, axes=%s takes the others"
@@ -170,7 +170,7 @@ def log_choice(content: SplatContent, fits: dict[str, Fit], best: str | None) ->
 
 
 def log_doubt(content: SplatContent, fits: dict[str, Fit], other: str) -> None:
-    """Warn of a file of a format with usual axes that would fit the scene better in others."""
+    """Warns of a file of a format with usual axes that would fit the scene better in others."""
     evidence = "; ".join(f"{axes}: {fit}" for axes, fit in fits.items())
     remedy = "export it with y up, as glTF has it" if content.by == FIXED else f"try axes={other}"
     logger.warning(

@@ -29,7 +29,7 @@ ENOUGH = 1_000_000
 
 
 def add_depth(run: Run, pictures: Pictures, pixels: int) -> None:
-    """Beside each view that is shown its depth, near bright, far dark, black where nothing is."""
+    """Adds to each view of the report its depth, near bright, far dark, black where nothing is."""
     for number, entry in zip(sorted(pictures.shown), pictures.views, strict=True):
         picture, limits = depth_colours(*depth_and_coverage(run, run.scene.test[number].camera, pixels))
         entry["files"]["depth"] = pictures.save(f"{pictures.names[number]}.depth", picture)
@@ -37,8 +37,10 @@ def add_depth(run: Run, pictures: Pictures, pixels: int) -> None:
 
 
 def depth_and_coverage(run: Run, camera: Camera, pixels: int) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
-    """(blending-weighted sum of camera z, coverage) of all but what stands behind the scene: drawn in place of colours,
-    for which loops are compiled already."""
+    """Returns (blending-weighted sum of camera z, coverage) of all but what stands behind the scene.
+
+    They are drawn in place of colours, for which loops are compiled already.
+    """
     splats = splats_for(run, camera)
     both = coverage_and_depth(splats, behind_scene(run.backbone, splats.means), camera)
     shown = replace(splats, colours=torch.cat([both, both[:, :1]], 1))
@@ -49,7 +51,7 @@ def depth_and_coverage(run: Run, camera: Camera, pixels: int) -> tuple[Float[Ten
 def depth_colours(
     summed: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"]
 ) -> tuple[Float[Tensor, "3 H W"], list[float]]:
-    """(mean depth as colours, [nearest, farthest] of them in scene units); distances by their inverse."""
+    """Returns (mean depth as colours, [nearest, farthest] in scene units); distances by their inverse."""
     seen = alpha > SEEN
     if not seen.any():
         return torch.zeros(3, *alpha.shape), []
@@ -62,7 +64,7 @@ def depth_colours(
 
 
 def add_flight(run: Run, pictures: Pictures, pixels: int) -> None:
-    """A strip of frames, one below the other, from a whole view into its most detailed window."""
+    """Adds a strip of frames, one below the other, from a whole view into its most detailed window."""
     number = min(pictures.shown)
     view = run.scene.test[number]
     place, zoom = goal(view, pictures)
@@ -73,7 +75,7 @@ def add_flight(run: Run, pictures: Pictures, pixels: int) -> None:
 
 
 def goal(view: View, pictures: Pictures) -> tuple[tuple[float, float], float]:
-    """(where the flight ends, in parts of the picture's sides; its zoom then): the window of the finest crop."""
+    """Returns (end of the flight, as shares of the picture's sides; its zoom there): the window of the finest crop."""
     crops = [crop for crop in pictures.crops if crop["view"] == view.name and crop["factor"] > 1]
     if not crops:
         return (0.5, 0.5), DEEPEST
@@ -85,7 +87,7 @@ def goal(view: View, pictures: Pictures) -> tuple[tuple[float, float], float]:
 
 
 def flight(camera: Camera, place: tuple[float, float], zoom: float) -> list[Camera]:
-    """Cameras of one raster that zoom evenly from the whole picture to that of `zoom` times the focal length."""
+    """Returns cameras of one raster that zoom evenly from the whole picture to `zoom` times the focal length."""
     shrink = min(1.0, LONGEST / max(camera.size))
     width, height = (max(1, round(side * shrink)) for side in camera.size)
     small, cameras = camera.resize(width, height), []

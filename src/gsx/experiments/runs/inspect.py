@@ -3,7 +3,7 @@
 import logging
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,24 +27,24 @@ from gsx.scenes.origin import around_origin, origin_of
 logger = logging.getLogger(__name__)
 
 SOG_PICTURE = "means_l.webp"
-"""A picture of each unbundled SOG."""
+"""A picture of every unbundled SOG."""
 Readable = list[tuple[Component, SceneFormat]]
-"""Loaders that can read a folder, the most telling first."""
+"""Loaders that can read a folder, the most specific first."""
 
 
 @dataclass
 class Findings:
-    """What is found out about a folder, by questions of which any may fail."""
+    """Lines about a folder, from steps of which any may fail."""
 
     lines: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     command: str = ""
     """Trains the scene."""
 
-    def ask(self, question: Callable[[], Iterable[str]]) -> None:
-        """Take the lines that `question` yields; its error becomes a problem."""
+    def add(self, lines: Iterable[str]) -> None:
+        """Adds lines as they are yielded; an error becomes a problem."""
         try:
-            for line in question():
+            for line in lines:
                 self.lines.append(line)
         except GsxError as problem:
             self.problems.append(str(problem))
@@ -53,41 +53,58 @@ class Findings:
 
 
 def describe(path: str | Path, plugins: Plugins, patient: bool = False) -> list[str]:
-    """Lines about a folder: format, cameras, images, points, how good the capture is, problems and the command to train
-    it. A `patient` one loads what takes minutes, too. Never raises."""
+    """Returns lines about a folder: format, cameras, images, points, capture, problems, and the command to train it.
+
+    patient: loads what takes minutes, too. Never raises.
+    """
     path, found = at_home(path), Findings()
     loaders: Readable = []
 
     def formats() -> Iterator[str]:
-        refuse_run(path)
-        refuse_splats(path)
-        loaders.extend(readable(path, plugins))
-        yield from format_lines(path, loaders, plugins)
+        loaders.extend(scene_loaders(path, plugins))
+        (loader, its), *others = loaders
+        yield f"format    {loader.name}: {its.meaning}"
+        if others:
+            yield f"also      readable as scene={' or scene='.join(other.name for other, _ in others)}"
 
-    found.ask(formats)
+    found.add(formats())
     if loaders:
         loader, its = loaders[0]
         found.command = training_command(loader, path, {})
-        found.ask(lambda: scene_lines(loader, its, path, found, plugins, patient))
+        found.add(scene_lines(loader, its, path, found, plugins, patient))
     problems = [f"problem   {problem}" for problem in found.problems]
     label = "then" if problems else "train"
     return [*found.lines, *problems, *([f"{label:10}{found.command}"] if found.command else [])]
 
 
+def scene_loaders(path: Path, plugins: Plugins) -> Readable:
+    """Returns the loaders that can read a folder, the most specific first.
+
+    Raises:
+        InputError: there is none, or it is a run or a splat file.
+    """
+    refuse_run(path)
+    refuse_splats(path)
+    loaders = readable(path, plugins)
+    if not loaders:
+        raise unknown(path, plugins)
+    return loaders
+
+
 def readable(path: Path, plugins: Plugins) -> Readable:
-    """The loaders that can read a folder, the most telling first; one that fails to look is named in the log."""
+    """Returns the loaders that can read a folder, the most specific first; logs one that fails."""
     found: Readable = []
     for loader, its in plugins.registry.formats():
         try:
             if its.recognise(path):
                 found.append((loader, its))
-        except Exception as error:  # a plugin's; the other loaders are asked all the same
+        except Exception as error:  # a plugin's; others may read it
             logger.warning("scene=%s cannot look at %s (%s: %s)", loader.name, path, type(error).__name__, error)
     return found
 
 
 def refuse_run(path: Path) -> None:
-    """Raise InputError for the folder of a run, which is no scene."""
+    """Raises InputError for the folder of a run, which is no scene."""
     others = any((path / name).exists() for name in (*BEGUN, "checkpoints"))
     if others and (path / "config.yaml").is_file():
         looks = ", ".join(command(verb, path) for verb in ("view", "eval", "resume"))
@@ -95,7 +112,7 @@ def refuse_run(path: Path) -> None:
 
 
 def refuse_splats(path: Path) -> None:
-    """Raise InputError for a splat file or the folder of a SOG, whose pictures are no photos."""
+    """Raises InputError for a splat file or the folder of a SOG, whose pictures are no photos."""
     file = splat_file_at(path)
     if file.is_file() and suffix_of(file):
         kind = "a splat file" if path.is_file() else f"an unbundled SOG, whose pictures hold splats ({file.name})"
@@ -107,22 +124,8 @@ def refuse_splats(path: Path) -> None:
         raise InputError(f"{path} holds pictures of a SOG ({SOG_PICTURE}) and no {META} that says so: copy it as well.")
 
 
-def format_lines(path: Path, loaders: Readable, plugins: Plugins) -> Iterator[str]:
-    """What the folder can be read as.
-
-    Raises:
-        InputError: nothing known.
-    """
-    if not loaders:
-        raise unknown(path, plugins)
-    (loader, its), *others = loaders
-    yield f"format    {loader.name}: {its.meaning}"
-    if others:
-        yield f"also      readable as scene={' or scene='.join(other.name for other, _ in others)}"
-
-
 def unknown(path: Path, plugins: Plugins) -> InputError:
-    """The error for a folder that no loader reads, with what they look for."""
+    """Returns the error for a folder that no loader reads, with what they look for."""
     if not path.is_dir():
         return InputError(f"'{path}' is no folder: check the name.")
     inner = {folder.name: readable(folder, plugins) for folder in sorted(path.iterdir()) if folder.is_dir()}
@@ -135,7 +138,7 @@ def unknown(path: Path, plugins: Plugins) -> InputError:
 def scene_lines(
     loader: Component, its: SceneFormat, path: Path, found: Findings, plugins: Plugins, patient: bool
 ) -> Iterator[str]:
-    """What lies in the folder, and what the loader makes of it."""
+    """Yields what lies in the folder, and what the loader makes of it."""
     yield from its.facts(path)
     overrides = its.overrides(path)
     found.command = training_command(loader, path, overrides)
@@ -143,26 +146,26 @@ def scene_lines(
         loaded = loader.factory(options_for(loader, path, overrides, plugins))
         scene = measured(around_origin(loaded, origin_of(loaded)))
         yield from loaded_lines(scene)
-        found.ask(lambda: capture_lines(scene))
+        found.add(capture_lines(scene))
     else:
         yield f"poses     not known yet: {command('scenes', path, '--poses')} finds them and judges the coverage"
 
 
 def training_command(loader: Component, path: Path, overrides: Mapping[str, str]) -> str:
-    """The command that trains a folder."""
+    """Returns the command that trains a folder."""
     more = [word_of(f"scene.{key}", value) for key, value in overrides.items()]
     return command(f"scene={loader.name}", word_of("scene.path", str(path)), *more)
 
 
 def options_for(loader: Component, path: Path, overrides: Mapping[str, str], plugins: Plugins) -> Any:
-    """The options that this command means."""
+    """Returns the options that this command means."""
     with hydra_session(plugins):
-        asked = OmegaConf.merge(compose_raw([f"scene={loader.name}"]).scene, {"path": str(path)} | dict(overrides))
-    return typed(loader.options, OmegaConf.to_container(asked, resolve=True), "scene")
+        node = OmegaConf.merge(compose_raw([f"scene={loader.name}"]).scene, {"path": str(path)} | dict(overrides))
+    return typed(loader.options, OmegaConf.to_container(node, resolve=True), "scene")
 
 
 def loaded_lines(scene: Scene) -> Iterator[str]:
-    """What the loader made of it."""
+    """Yields what the loader made of it."""
     views = [*scene.train, *scene.test]
     for (width, height), count in sorted(Counter(view.camera.size for view in views).items()):
         yield f"views     {count} of {width}x{height}"

@@ -26,8 +26,9 @@ WORKING = "working"
 
 @contextmanager
 def waiting_for_all(folder: Path) -> Iterator[None]:
-    """The first Ctrl-C, or signal of a job's end, ends the jobs in processes of a launcher; none begins after it. Where
-    there are none it is as ever, and so is a second Ctrl-C. Threads but the main one hear no signals.
+    """Ends the jobs in processes of a launcher at the first Ctrl-C or signal of a job's end; none begins after it.
+
+    Without such processes, and at a second Ctrl-C, nothing changes. Threads but the main one hear no signals.
 
     Raises:
         KeyboardInterrupt, SystemExit: there was one, and all have ended.
@@ -69,27 +70,28 @@ def waiting_for_all(folder: Path) -> Iterator[None]:
 
 
 def give_back(handlers: dict[signal.Signals, Any]) -> None:
-    """Handle signals as before."""
+    """Restores handlers of signals."""
     for number, handler in handlers.items():
         signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
 def forget(folder: Path) -> None:
-    """Remove what processes tell each other in a folder."""
+    """Removes the messages between processes in a folder."""
     (folder / STOPPED).unlink(missing_ok=True)
     rmtree(folder / WORKING, ignore_errors=True)
 
 
 def is_launched() -> bool:
-    """Whether this is a process of a launcher's, for which another one waits."""
+    """Returns whether this is a process of a launcher, for which another one waits."""
     parent = parent_process()
     return parent is not None and os.environ.get(LAUNCHER) == str(parent.pid)
 
 
 @contextmanager
 def ended_from_without(folder: Path) -> Iterator[None]:
-    """A job in a process of a launcher: the first signal raises KeyboardInterrupt, unless training heeds it; none ends
-    the process, now or between its jobs. Anywhere else nothing changes.
+    """Turns the first signal to a job in a process of a launcher into KeyboardInterrupt, unless training handles it.
+
+    No signal ends the process, now or between its jobs. Anywhere else nothing changes.
 
     Raises:
         KeyboardInterrupt: it was ended, or jobs of `folder` do not begin any more.

@@ -25,7 +25,7 @@ HIDDEN_SHARE, LARGEST_EXTENT = 0.02, 1e3
 
 
 def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
-    """Return the scene, with views to evaluate on unless scene.split=none trains on all.
+    """Returns the scene, with views to evaluate on unless scene.split=none trains on all.
 
     origin: of the model that is at hand; None: the scene's own.
 
@@ -50,7 +50,7 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
 
 
 def held_out_none(scene: Scene, rule: str) -> Scene:
-    """Return a scene without test views, with a note that says so.
+    """Returns a scene without test views, with a note that says so.
 
     Raises:
         InputError: its split is another than `none`.
@@ -64,7 +64,7 @@ def held_out_none(scene: Scene, rule: str) -> Scene:
 
 
 def checked(scene: Any, loader: str) -> Scene:
-    """What a loader, maybe a plugin's, has returned.
+    """Checks what a loader, maybe a plugin's, has returned.
 
     Raises:
         InputError: it is no scene that can be trained on and judged.
@@ -92,13 +92,13 @@ def checked(scene: Any, loader: str) -> Scene:
 
 
 def finite(camera: Camera) -> bool:
-    """Whether all numbers of a camera are."""
+    """Returns whether all numbers of a camera are finite."""
     numbers = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
     return all(bool(torch.isfinite(values).all()) for values in (numbers, camera.rotation, camera.translation))
 
 
 def count_notes(settings: Settings) -> list[str]:
-    """What to know where the folder of a published scene holds another number of images than was published."""
+    """Returns a note where the folder of a published scene holds another number of images than was published."""
     dataset, path = settings.dataset, getattr(settings.scene.options, "path", "")
     published = dataset.images.get(dataset.scene) if dataset else None
     if not (published and path):
@@ -109,14 +109,14 @@ def count_notes(settings: Settings) -> list[str]:
 
 
 def with_more_points(scene: Scene, count: int, seed: int) -> Scene:
-    """The scene with points where training views show none."""
+    """Returns the scene with points where training views show none."""
     if count == 0:
         return scene
     return filled(scene, count, torch.Generator().manual_seed(derived_seed("fill", seed)))
 
 
 def checked_unit(unit: float) -> float:
-    """Return the unit.
+    """Returns the unit.
 
     Raises:
         ConfigError: it is not a positive number.
@@ -127,19 +127,19 @@ def checked_unit(unit: float) -> float:
 
 
 def placed(scene: Scene, unit: float, origin: Origin | None) -> Scene:
-    """Return the scene around an origin, in units; origin: in these units, None: chosen by the scene."""
+    """Returns the scene around an origin, in units; origin: in these units, None: chosen by the scene."""
     origin = scaled(origin_of(scene), unit) if origin is None else origin
     return replace(in_units(around_origin(scene, scaled(origin, 1 / unit)), unit), origin=origin)
 
 
 def scaled(origin: Origin, factor: float) -> Origin:
-    """Return an origin in other units."""
+    """Returns an origin in other units."""
     x, y, z = (value * factor for value in origin)
     return x, y, z
 
 
 def in_units(scene: Scene, unit: float) -> Scene:
-    """The scene with positions of cameras and points multiplied by `unit`."""
+    """Returns the scene with positions of cameras and points multiplied by `unit`."""
     if unit == 1:
         return scene
     return replace(
@@ -153,12 +153,12 @@ def in_units(scene: Scene, unit: float) -> Scene:
 
 
 def rescaled(view: View, unit: float) -> View:
-    """The view with its camera's position multiplied by `unit`."""
+    """Returns the view with its camera's position multiplied by `unit`."""
     return replace(view, camera=replace(view.camera, translation=view.camera.translation * unit))
 
 
 def hidden_share(scene: Scene) -> float:
-    """Share of the points in front of training cameras that their near planes hide."""
+    """Returns the share of the points in front of training cameras that their near planes hide."""
     front = hidden = 0
     for view in scene.train:
         depth = view.camera.project(scene.points.positions)[1]
@@ -168,7 +168,7 @@ def hidden_share(scene: Scene) -> float:
 
 
 def warned_of_units(scene: Scene) -> Scene:
-    """The scene, with a note if its units are far from those that published constants expect."""
+    """Returns the scene, with a note if its units are far from those that published constants expect."""
     share = hidden_share(scene)
     if share <= HIDDEN_SHARE and scene.extent <= LARGEST_EXTENT:
         return scene
@@ -180,5 +180,5 @@ def warned_of_units(scene: Scene) -> Scene:
 
 
 def unit_of(run: Run) -> float:
-    """What the scene's positions were multiplied by."""
+    """Returns what the scene's positions were multiplied by."""
     return float(run.config["scene"].get("unit", 1.0))

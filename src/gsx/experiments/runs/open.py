@@ -1,4 +1,4 @@
-"""A run's folder: made for a new run, opened again, gone on with."""
+"""The folder of a run: made for a new one, opened again, and gone on with."""
 
 import logging
 import shutil
@@ -23,13 +23,7 @@ from gsx.engine.collector import gc_paused
 from gsx.experiments.evaluation.lpips import load_lpips
 from gsx.experiments.run_folder.claims import LOCK, claimed
 from gsx.experiments.run_folder.files import RunFiles, is_number, read_run
-from gsx.experiments.run_folder.run_key import (
-    composition_key,
-    finished,
-    other_revision,
-    place_of,
-    trained_on,
-)
+from gsx.experiments.run_folder.run_key import composition_key, finished, other_revision, place_of, trained_on
 from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.build import build, choose_device, prepare_compiling, refuse_uneven
 from gsx.experiments.runs.environment import environment
@@ -54,7 +48,7 @@ OF_TRAINING = ("iterations", "length", "seed", "init", "axes", "reuse", "warm_st
 
 
 def refuse_used(folder: str, remedy: str = "") -> None:
-    """Raise InputError if the run folder asked for exists and holds something; `remedy`: of what does not train."""
+    """Raises InputError if the run folder exists and holds something; `remedy`: of verbs that do not train."""
     path = Path(folder)
     if folder and path.exists() and not path.is_dir():
         raise InputError(f"'{folder}' is a file, no folder for a run: choose another place")
@@ -64,7 +58,7 @@ def refuse_used(folder: str, remedy: str = "") -> None:
 
 
 def new_folder(settings: Settings, scene: Scene) -> Path:
-    """A fresh run folder.
+    """Makes a fresh run folder.
 
     Raises:
         InputError: no free name was found.
@@ -88,7 +82,7 @@ def new_folder(settings: Settings, scene: Scene) -> Path:
 
 @gc_paused()
 def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None) -> Run:
-    """Load the scene and build a run in a new folder, with config.yaml and environment.json written.
+    """Loads the scene and builds a run in a new folder, with config.yaml and environment.json written.
 
     Of several processes the first does what concerns the folder, which is claimed as long as `claims` lasts.
 
@@ -117,17 +111,15 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
 
 
 def begun(run: Run, settings: Settings, plugins: Plugins, claims: ExitStack | None, doubts: Sequence[str] = ()) -> Path:
-    """The folder of a new run, with what is known before its first step; `init=warm_start`: at the state of another."""
+    """Makes the folder of a new run, with its first files; with `init=warm_start` it is at the state of another run."""
     run.folder = new_folder(settings, run.scene)
     if claims is not None:
         claims.enter_context(claimed(run.folder))
         refuse_used(settings.general.folder)  # by another process that was faster
     try:
         write_config(run.folder / "config.yaml", settings.resolved)
-        write_json(
-            run.folder / "environment.json",
-            environment(run, plugins, settings.idle) | ({"start": doubts} if doubts else {}),
-        )
+        facts = environment(run, plugins, settings.idle) | ({"start": doubts} if doubts else {})
+        write_json(run.folder / "environment.json", facts)
         if settings.general.init == "warm_start":
             warm_start.adopt(run, warm_start.warm_start_folder(run, settings.idle, plugins.versions))
             run.curves = read_curves(run.folder)
@@ -138,7 +130,7 @@ def begun(run: Run, settings: Settings, plugins: Plugins, claims: ExitStack | No
 
 
 def refuse_other(folder: Path) -> None:
-    """Raise InputError for a path that is no run."""
+    """Raises InputError for a path that is no run."""
     if folder.is_file():
         name = "" if suffix_of(folder) else f". If it holds splats, let its name end in one of {', '.join(SUFFIXES)}"
         raise InputError(f"{folder} is a file and no run folder: give a folder that `gsx` made{name}")
@@ -147,7 +139,7 @@ def refuse_other(folder: Path) -> None:
 
 
 def refuse_training(folder: Path, overrides: Sequence[str]) -> None:
-    """Raise ConfigError for an override that changes how a run is trained, or where, and nothing of what it shows."""
+    """Raises ConfigError for an override that changes how or where a run is trained, and no figure of it."""
     for word in overrides:
         if key_of(word) in OF_TRAINING:
             longer = f"; {command('resume', folder, word)} trains on" if key_of(word) == "iterations" else ""
@@ -157,7 +149,7 @@ def refuse_training(folder: Path, overrides: Sequence[str]) -> None:
 
 
 def refuse_code(folder: Path, settings: Settings, overrides: Sequence[str]) -> None:
-    """Raise InputError for a folder that names code to be run, unless the command line names the same."""
+    """Raises InputError for a folder that names code to be run, unless the command line names the same."""
     words = [word.partition("=") for word in overrides]
     for key, code in named_code(settings).items():
         if code not in [str(value_of(value)) for name, _, value in words if name.startswith(f"{key}.")]:
@@ -170,7 +162,7 @@ def refuse_code(folder: Path, settings: Settings, overrides: Sequence[str]) -> N
 def open_run(
     folder: Path, plugins: Plugins, overrides: Sequence[str] = (), training: bool = False, trusted: bool = False
 ) -> tuple[Run, Settings]:
-    """A run as its newest checkpoint left it; `training`: it is about to go on; `trusted`: with code that it names.
+    """Returns a run as its newest checkpoint left it; `training`: it goes on; `trusted`: it may run code that it names.
 
     Raises:
         InputError: the folder is no run, or names code and is not trusted.
@@ -184,7 +176,7 @@ def open_run(
 
 
 def trained_origin(folder: Path) -> Origin | None:
-    """Return the origin of positions in a run's checkpoints, (0, 0, 0) for those of gsx before origins.
+    """Returns the origin of positions in a run's checkpoints.
 
     None: no checkpoint can be read; `checkpoint.restore` says why.
     """
@@ -196,11 +188,11 @@ def trained_origin(folder: Path) -> Origin | None:
 
 
 def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
-    """The run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
+    """Returns the run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
     origin = trained_origin(folder)
     checked = verified if training else (lambda scene: scene)
-    loaded = ranks_here().rank0_first(lambda: checked(load_scene(settings, origin)))
-    run = build(settings, loaded, folder, training, begins=False)
+    scene = ranks_here().rank0_first(lambda: checked(load_scene(settings, origin)))
+    run = build(settings, scene, folder, training, begins=False)
     checkpoint.restore(run, training)
     focal = read_run(folder).environment.get("training_focal")
     if run.raster.training_focal and is_number(focal):  # the scene may be looked at in another size
@@ -242,27 +234,27 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: Ex
 
 
 def gone_on_with(folder: Path, files: RunFiles, settings: Settings, stamp: str) -> Run:
-    """The run of a folder that is named by its composition; where it does not tell its scene's stamp, its name does.
+    """Returns the run of a folder that is named by its composition.
 
     Raises:
         CheckpointError: there is nothing in it to go on with.
     """
     if not checkpoint.sidecars(folder / "checkpoints"):
         raise CheckpointError(f"{folder} holds no checkpoint")
-    scene = trained_on(files) if files.environment else stamp
+    scene = trained_on(files) if files.environment else stamp  # the name of the folder tells it as well
     if composition_key(files.config, scene, settings.idle) != folder.name:
         raise CheckpointError(f"{folder} was trained on by another composition than the one it is named by")
     return restored(settings, folder, training=True)
 
 
 def by_another(files: RunFiles) -> str:
-    """Words for what another revision of the source has trained; none for what this one has."""
+    """Returns words for what another revision of the source has trained; none for what this one has."""
     revision = other_revision(files, this := source_revision())
     return f" by another revision of gsx's source ({revision}, this is {this})" if revision else ""
 
 
 def set_aside(folder: Path, reason: str) -> None:
-    """Make room for a run in a folder without a checkpoint that it could use; what has results is kept beside it."""
+    """Makes room for a run in a folder without a usable checkpoint; one with results is kept beside it."""
     if not folder.exists():
         return
     results = [folder / "evaluation.json", folder / "point_cloud.ply", *checkpoint.sidecars(folder / "checkpoints")]
@@ -275,6 +267,6 @@ def set_aside(folder: Path, reason: str) -> None:
 
 
 def as_trained(run: Run) -> RasterSettings:
-    """The rules a run is drawn by, with path=auto as its training decided it, so that times are those of one path."""
+    """Returns the rules of a run with path=auto as its training decided it, so that times are those of one path."""
     path = read_run(run.folder).environment.get("rasterizer")
     return replace(run.raster, path=path) if run.raster.path == "auto" and path == "compiled" else run.raster

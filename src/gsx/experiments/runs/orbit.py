@@ -1,4 +1,4 @@
-"""A closed camera path through what the training cameras saw, and animations of it.
+"""A closed camera path through what the training cameras show, and animations.
 
 The path lives in cylindrical coordinates about the point the cameras look at: bearing around the mean up direction,
 distance from that axis, height along it. Cameras that surround the point give a full circle; cameras on one side give
@@ -6,7 +6,7 @@ a small ellipse of bearing and height; cameras that look outward give a turn on 
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import chain
@@ -40,6 +40,23 @@ GIF_FASTEST = 50
 """GIF delays are whole hundredths of a second, and viewers slow down below two of them."""
 
 
+@dataclass(frozen=True)
+class Encoding:
+    """How FFmpeg writes an animation."""
+
+    codec: str
+    quality: dict[str, str]
+    container: dict[str, str]
+
+
+GIF = ".gif"
+ENCODINGS = {
+    ".webp": Encoding("libwebp_anim", {"quality": "85"}, {"loop": "0"}),
+    ".mp4": Encoding("libx264", {"crf": "18"}, {"movflags": "+faststart"}),  # H.264, with its index first
+}
+SUFFIXES = (GIF, *ENCODINGS)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Orbit:
     """A closed path about an axis: position and viewing direction as functions of a phase in [0, 2 pi)."""
@@ -61,11 +78,11 @@ class Orbit:
     """Look away from the axis."""
 
     def direction(self, bearing: float) -> Float[Tensor, "3"]:
-        """Horizontal unit vector from the axis."""
+        """Returns the horizontal unit vector from the axis."""
         return math.cos(bearing) * self.axes[0] + math.sin(bearing) * self.axes[1]
 
     def pose(self, phase: float) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        """Eye and a point to look at."""
+        """Returns the eye and a point to look at."""
         full = self.swing >= math.pi
         bearing = self.bearing + (phase if full else self.swing * math.cos(phase))
         height = self.height + self.rise * math.sin(phase)
@@ -75,7 +92,7 @@ class Orbit:
 
 
 def orbit_cameras(scene: Scene, frames: int) -> list[Camera]:
-    """Cameras on a closed orbit with the raster and field of view of the first training camera.
+    """Returns cameras on a closed orbit with the raster and field of view of the first training camera.
 
     Raises:
         InputError: frames is below 2, or the cameras look straight along their own up direction.
@@ -87,7 +104,7 @@ def orbit_cameras(scene: Scene, frames: int) -> list[Camera]:
 
 
 def on_path(path: Orbit, phase: float, model: Camera) -> Camera:
-    """The camera at a phase, with the intrinsics of `model` around the middle of its raster."""
+    """Returns the camera at a phase, with the intrinsics of `model` around the middle of its raster."""
     eye, goal = path.pose(phase)
     fov_x = 2 * math.atan(model.width / (2 * model.fx))
     try:
@@ -106,7 +123,7 @@ def on_path(path: Orbit, phase: float, model: Camera) -> Camera:
 
 
 def fit_path(cameras: Sequence[Camera], points: Float[Tensor, "P 3"], extent: float) -> Orbit:
-    """The path that suits the cameras; `points` say how deep the scene is where viewing rays do not meet."""
+    """Returns the path that suits the cameras; `points` give the depth where viewing rays do not meet."""
     centres = torch.stack([camera.centre for camera in cameras]).double()
     rotations = torch.stack([camera.rotation for camera in cameras]).double()
     forwards = rotations[:, 2]
@@ -137,7 +154,7 @@ def fit_path(cameras: Sequence[Camera], points: Float[Tensor, "P 3"], extent: fl
 def scene_depth(
     centres: Float[Tensor, "K 3"], forwards: Float[Tensor, "K 3"], points: Float[Tensor, "P 3"], extent: float
 ) -> float:
-    """Median depth of the points in front of the mean camera, scene units."""
+    """Returns the median depth of the points in front of the mean camera, scene units."""
     mean = forwards.mean(0)
     depths = (points - centres.mean(0)) @ mean / mean.norm().clamp_min(1e-9)
     front = depths[depths > 0]
@@ -147,7 +164,7 @@ def scene_depth(
 def nearest_to_rays(
     centres: Float[Tensor, "K 3"], forwards: Float[Tensor, "K 3"]
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
-    """A, b of A x = b, solved by the point nearest to all viewing rays; A is singular where they are parallel."""
+    """Returns A, b of A x = b for the point x nearest to all viewing rays; A is singular where they are parallel."""
     across = torch.eye(3, dtype=centres.dtype) - forwards[:, :, None] * forwards[:, None, :]
     return across.sum(0), (across @ centres[:, :, None]).sum(0)[:, 0]
 
@@ -155,7 +172,7 @@ def nearest_to_rays(
 def look_at_point(
     centres: Float[Tensor, "K 3"], forwards: Float[Tensor, "K 3"], depth: float
 ) -> tuple[Float[Tensor, "3"], bool]:
-    """The point closest to all viewing rays, and whether it lies in front of the cameras.
+    """Returns the point closest to all viewing rays, and whether it lies in front of the cameras.
 
     Nearly parallel rays meet nowhere: then the point at `depth` in front of the mean camera.
     """
@@ -168,7 +185,7 @@ def look_at_point(
 
 
 def axes_about(up: Float[Tensor, "3"], hint: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Right-handed orthonormal rows with `up` last and the first as near to `hint` as can be."""
+    """Returns right-handed orthonormal rows with `up` last and the first as near to `hint` as can be."""
     level = hint - (hint @ up) * up
     if level.norm() < 1e-3:
         level = torch.eye(3, dtype=up.dtype)[up.abs().argmin()]
@@ -178,7 +195,7 @@ def axes_about(up: Float[Tensor, "3"], hint: Float[Tensor, "3"]) -> Float[Tensor
 
 
 def arc(bearings: Sequence[float]) -> tuple[float, float]:
-    """Middle and half-width, radians, of the shortest arc that holds all bearings; half-width pi if they surround."""
+    """Returns middle and half-width, radians, of the shortest arc with all bearings; half-width pi if they surround."""
     ordered = sorted(bearings)
     following = [*ordered[1:], ordered[0] + 2 * math.pi]
     gap, start = max((b - a, b) for a, b in zip(ordered, following, strict=True))
@@ -192,40 +209,33 @@ def arc(bearings: Sequence[float]) -> tuple[float, float]:
 
 
 def write_animation(path: Path, frames: Iterable[Float[Tensor, "3 H W"]], fps: float) -> None:
-    """Write frames, display values in [0, 1], one at a time: .gif anywhere; .webp and .mp4 with the extra `video`.
+    """Writes frames, display values in [0, 1]: .gif anywhere; .webp and .mp4 with the extra `video`.
 
-    The file appears whole or not at all.
+    Frames are written one at a time; the file appears whole or not at all.
 
     Raises:
         InputError: the suffix, the speed or a frame size is unsuitable, there are no frames, or PyAV is missing.
     """
-    writer = writer_for(path)
-    fastest = GIF_FASTEST if writer is write_gif else FASTEST
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(
+            f"'{path}' is no animation gsx can write: use {', '.join(SUFFIXES)}.{nearest(suffix, SUFFIXES)}"
+        )
+    if suffix != GIF:
+        import_av(path)  # before frames are rendered
+    fastest = GIF_FASTEST if suffix == GIF else FASTEST
     if not SLOWEST <= fps <= fastest:
         raise InputError(f"{path} cannot play at {fps:g} frames per second: use {SLOWEST:g} to {fastest}")
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as partial:
-        writer(partial, checked(path, frames), fps)
-
-
-def writer_for(path: Path) -> Callable[[Path, Iterator[Tensor], float], None]:
-    """What writes this kind of file.
-
-    Raises:
-        InputError: nothing does, or PyAV is needed and missing.
-    """
-    suffix = path.suffix.lower()
-    if suffix not in WRITERS:
-        choices = ", ".join(WRITERS)
-        raise InputError(f"'{path}' is no animation gsx can write: use {choices}.{nearest(suffix, WRITERS)}")
-    writer = WRITERS[suffix]
-    if writer is not write_gif:
-        import_av(path)
-    return writer
+        if suffix == GIF:
+            write_gif(partial, checked(path, frames), fps)
+        else:
+            encode(ENCODINGS[suffix], partial, checked(path, frames), fps)
 
 
 def import_av(path: Path) -> Any:
-    """PyAV, which brings FFmpeg's encoders."""
+    """Returns PyAV, which brings FFmpeg's encoders."""
     try:
         import av
     except ImportError as error:
@@ -236,7 +246,7 @@ def import_av(path: Path) -> Any:
 
 
 def checked(path: Path, frames: Iterable[Float[Tensor, "3 H W"]]) -> Iterator[UInt8[Tensor, "H W 3"]]:
-    """Frames as bytes, each of the size of the first, none too large."""
+    """Yields frames as bytes, each of the size of the first, none too large."""
     size = None
     for frame in frames:
         width, height = frame.shape[2], frame.shape[1]
@@ -253,7 +263,7 @@ def checked(path: Path, frames: Iterable[Float[Tensor, "3 H W"]]) -> Iterator[UI
 
 
 def write_gif(path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) -> None:
-    """An endless GIF; the delay is rounded to hundredths of a second."""
+    """Writes an endless GIF; the delay is rounded to hundredths of a second."""
     import OpenImageIO as oiio
 
     output = oiio.ImageOutput.create("gif")
@@ -273,47 +283,17 @@ def write_gif(path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) 
             output.close()
 
 
-def write_webp(path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) -> None:
-    """An endless animated WebP."""
-    encode(
-        path, frames, fps, codec="libwebp_anim", pixels="yuv420p", quality={"quality": "85"}, container={"loop": "0"}
-    )
-
-
-def write_mp4(path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) -> None:
-    """H.264 that every browser plays, with its index first."""
-    container = {"movflags": "+faststart"}
-    encode(path, frames, fps, codec="libx264", pixels="yuv420p", quality={"crf": "18"}, container=container)
-
-
-def encode(
-    path: Path,
-    frames: Iterator[UInt8[Tensor, "H W 3"]],
-    fps: float,
-    *,
-    codec: str,
-    pixels: str,
-    quality: dict[str, str],
-    container: dict[str, str],
-) -> None:
-    """Encode with PyAV. An odd last row or column is dropped: 4:2:0 colour needs even sizes."""
+def encode(encoding: Encoding, path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) -> None:
+    """Encodes frames with PyAV. An odd last row or column is dropped: 4:2:0 colour needs even sizes."""
     av = import_av(path)
     first = next(frames)
     height, width = (size // 2 * 2 for size in first.shape[:2])
     if not (height and width):
         raise InputError(f"{path}: frames of {first.shape[1]}x{first.shape[0]} px are too small for that; give a .gif")
-    with av.open(str(path), mode="w", options=container) as output:
-        stream = output.add_stream(codec, rate=Fraction(fps).limit_denominator(1000), options=quality)
-        stream.width, stream.height, stream.pix_fmt = width, height, pixels
+    with av.open(str(path), mode="w", options=encoding.container) as output:
+        stream = output.add_stream(encoding.codec, rate=Fraction(fps).limit_denominator(1000), options=encoding.quality)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         for frame in chain([first], frames):
             picture = av.VideoFrame.from_ndarray(frame[:height, :width].contiguous().numpy(), format="rgb24")
             output.mux(stream.encode(picture))
         output.mux(stream.encode())
-
-
-WRITERS: dict[str, Callable[[Path, Iterator[Tensor], float], None]] = {
-    ".gif": write_gif,
-    ".webp": write_webp,
-    ".mp4": write_mp4,
-}
-"""Writer by suffix."""

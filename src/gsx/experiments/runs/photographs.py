@@ -35,8 +35,10 @@ FOLDER = "photographs"
 
 @relieve_oversubscription()
 def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Sequence[str] = ()) -> list[Finding]:
-    """Findings on all training photographs of a run, worst first; its folder keeps them, with pictures of so many, and
-    its report shows them.
+    """Returns findings on all training photographs of a run, worst first.
+
+    The folder keeps them, with pictures of the `worst` ones, and the report shows them.
+
 
     Raises:
         ConfigError, InputError: an override is wrong, the folder is no run, or somebody trains in it.
@@ -55,7 +57,7 @@ def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Seq
 
 
 def findings_of(run: Run, pixels: int) -> list[Finding]:
-    """Of every training photograph, worst first."""
+    """Returns findings on every training photograph, worst first."""
     views = different(run.train_views)
     progress, known = Countdown("looking at photographs", len(views)), sharpness_of(run.scene.train)
     found = []
@@ -68,12 +70,12 @@ def findings_of(run: Run, pixels: int) -> list[Finding]:
 
 
 def different(views: Sequence[View]) -> list[View]:
-    """Each view once: some protocols show the same one several times."""
+    """Returns each view once: some protocols have the same one several times."""
     return list({view.name: view for view in views}.values())
 
 
 def sharpness_of(views: Sequence[View]) -> dict[str, float]:
-    """Fineness against neighbours by the name of a view, of those that are photographs."""
+    """Returns sharpness against neighbours by the name of a view, of those that are photographs."""
     files = {view.name: view.source.path for view in views if isinstance(view.source, PhotoSource)}
     found = sharpness(sorted(set(files.values())))
     return {name: found[path] for name, path in files.items() if path in found}
@@ -81,7 +83,7 @@ def sharpness_of(views: Sequence[View]) -> dict[str, float]:
 
 @torch.no_grad()
 def finding(run: Run, view: View, known_sharpness: float | None, pixels: int) -> Finding:
-    """One photograph beside the render; without remarks."""
+    """Compares one photograph with the render; without remarks."""
     own, photograph, counted = render(run, view.camera, pixels).image, view.image(), view.counted()
     shown = at_exposure(run, view, own)
     error = blacked(shown - photograph, counted).square().mean(0)
@@ -97,13 +99,13 @@ def finding(run: Run, view: View, known_sharpness: float | None, pixels: int) ->
 
 
 def at_exposure(run: Run, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """A render at the exposure and with the movement that were found for its photograph, if any; on the CPU."""
+    """Returns a render at the exposure and with the movement of its photograph, on the CPU."""
     return run.as_photographed(image, view).clamp(0, 1).cpu()
 
 
 @torch.no_grad()
 def write_findings(run: Run, findings: Sequence[Finding], worst: int, pixels: int) -> None:
-    """index.json with all findings, and pictures of the worst."""
+    """Writes index.json with all findings, and pictures of the worst."""
     place = Pictures(run.folder / FOLDER, run.step)
     place.folder.mkdir(parents=True, exist_ok=True)
     forget(place.folder)
@@ -119,7 +121,7 @@ def write_findings(run: Run, findings: Sequence[Finding], worst: int, pixels: in
 
 
 def lines(findings: Sequence[Finding], worst: int) -> list[str]:
-    """What is told on the terminal."""
+    """Returns lines for the terminal."""
     wrong = [one for one in findings if one.remarks]
     middle = median(one.psnr for one in findings)
     out = [f"training photographs: {len(findings)}, median {middle:.2f} dB; standing out: {len(wrong)}"]

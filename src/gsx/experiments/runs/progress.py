@@ -22,7 +22,7 @@ SMOOTHING = 0.3
 
 
 def clock(seconds: float) -> str:
-    """m:ss, or h:mm:ss."""
+    """Returns seconds as m:ss, or h:mm:ss."""
     whole = max(0, int(seconds))
     hours, rest = divmod(whole, 3600)
     return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60}:{rest % 60:02d}"
@@ -38,14 +38,14 @@ class Line:
         self.width = 0
 
     def due(self) -> bool:
-        """Whether it is time to show another; then the time counts from now on."""
+        """Returns whether it is time to show another; then the time counts from now on."""
         now = time.monotonic()
         due = now - self.shown >= (LIVE_SECONDS if self.live else PLAIN_SECONDS)
         self.shown = now if due else self.shown
         return due
 
     def show(self, text: str) -> None:
-        """Write over the last line on a terminal, below it elsewhere."""
+        """Writes over the last line on a terminal, below it elsewhere."""
         end, start = ("", "\r") if self.live else ("\n", "")
         text = text[: self.room()]
         with suppress(OSError):  # its terminal was closed
@@ -54,14 +54,14 @@ class Line:
         self.width = len(text)
 
     def room(self) -> int | None:
-        """Letters that a terminal has for it, since what wraps is not written over; None where there is no end."""
+        """Returns how many letters a terminal has for it: longer lines wrap and stay; None without a terminal."""
         with suppress(OSError, ValueError):  # no terminal
             columns = os.get_terminal_size(self.stream.fileno()).columns
             return columns - 1 if columns > 1 else None
         return None
 
     def end(self) -> None:
-        """Leave the last line standing."""
+        """Leaves the last line standing."""
         if self.live and self.width:
             with suppress(OSError):
                 self.stream.write("\n")
@@ -69,62 +69,62 @@ class Line:
 
 
 class Countdown:
-    """Shows how far a piece of work has come, and the time left if the rest of it goes as fast."""
+    """A line with the share of a piece of work that is done, and the time left at the same speed."""
 
     def __init__(self, what: str, total: float) -> None:
         self.what, self.total, self.line = what, total, Line()
-        self.done, self.begun = 0.0, time.monotonic()
+        self.done, self.started = 0.0, time.monotonic()
 
     def advance(self, amount: float, part: str) -> None:
-        """So much more of `total` is done, the last of it `part`."""
+        """Adds to what is done of `total`; `part`: the last of it, in words."""
         self.done += amount
         left = max(0.0, self.total - self.done)
         last = left < 1e-6 * self.total
         if self.line.due() or last:
-            seconds = (time.monotonic() - self.begun) * left / self.done
+            seconds = (time.monotonic() - self.started) * left / self.done
             self.line.show(f"{self.what} {self.done / self.total:.0%}  {part}  ETA {clock(seconds)}")
         if last:
             self.line.end()
 
 
 class Progress:
-    """Listener: shows step, speed, loss, PSNR, primitives, memory and time left."""
+    """Listener that shows step, speed, loss, PSNR, primitives, memory and time left."""
 
     def __init__(self) -> None:
         self.output = Line()
-        self.taken, self.shown = 0, 0.0
+        self.steps, self.shown = 0, 0.0
         """Steps since the line was shown, and the seconds that had been trained for by then."""
         self.averages: dict[str, float] = {}
 
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
-        """Speed is measured from here on."""
+        """Measures speed from here on."""
         self.shown = run.seconds
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
-        """Show the line when it is time."""
-        self.taken += 1
+        """Shows the line when it is time."""
+        self.steps += 1
         if not self.output.due() and not run.complete:
             return
         self.average("loss", float(step.loss))
         self.average("psnr", step.psnr())
-        self.average("speed", self.taken / max(run.seconds - self.shown, 1e-9))
-        self.taken, self.shown = 0, run.seconds
+        self.average("speed", self.steps / max(run.seconds - self.shown, 1e-9))
+        self.steps, self.shown = 0, run.seconds
         self.output.show(self.line(run))
 
     @hookimpl
     def gsx_training_finished(self, run: Run) -> None:
-        """Leave the last line standing."""
+        """Leaves the last line standing."""
         self.output.end()
 
     def average(self, name: str, value: float) -> None:
-        """Exponential average of what was shown."""
+        """Averages what is displayed, exponentially."""
         old = self.averages.get(name, value)
         self.averages[name] = old + SMOOTHING * (value - old)
 
     def line(self, run: Run) -> str:
-        """The line as shown."""
+        """Returns the line."""
         a, primitives, memory = self.averages, len(run.backbone.table), peak_memory_mb(run.device)
         megabytes = "" if memory is None else f"  {memory:,.0f} MB"
         return (
@@ -135,12 +135,12 @@ class Progress:
 
 
 def read_curves(folder: Path) -> list[dict[str, Any]]:
-    """Lines of a run's metrics.jsonl; one that a crash cut off is left out."""
+    """Returns the lines of a run's metrics.jsonl, without one that a crash cut off."""
     return read_lines(folder / METRICS, {})
 
 
 class MetricsLog:
-    """Listener: appends to metrics.jsonl every `training.log_every` steps, test PSNR at evenly spaced points."""
+    """Listener that appends to metrics.jsonl every `training.log_every` steps, test PSNR at evenly spaced points."""
 
     def __init__(self, options: EvalOptions) -> None:
         self.options = options
@@ -148,7 +148,7 @@ class MetricsLog:
 
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
-        """Open the file; a resumed run drops lines later than its checkpoint."""
+        """Opens the file; a resumed run drops lines later than its checkpoint."""
         path = run.folder / METRICS
         run.curves[:] = [line for line in read_curves(run.folder) if line["step"] <= run.step]
         replace_file(path, "".join(json.dumps(line) + "\n" for line in run.curves).encode())
@@ -156,11 +156,11 @@ class MetricsLog:
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
-        """Write a line when due, or when something noteworthy happened."""
+        """Writes a line when due, or when something noteworthy happened."""
         points = run.training.test_points
         tested = points > 0 and run.step * points // run.iterations > (run.step - 1) * points // run.iterations
-        told = step.changes or step.pseudo or step.skipped
-        if not (run.step % run.training.log_every == 0 or told or tested or run.step == 1):
+        event = step.changes or step.pseudo or step.skipped
+        if not (run.step % run.training.log_every == 0 or event or tested or run.step == 1):
             return
         line = self.entry(run, step)
         if tested and run.scene.test:
@@ -171,7 +171,7 @@ class MetricsLog:
         self.stream.flush()
 
     def entry(self, run: Run, step: StepResult) -> dict:
-        """One line of metrics.jsonl."""
+        """Returns one line of metrics.jsonl."""
         memory = peak_memory_mb(run.device)
         line = {
             "step": run.step,
@@ -190,10 +190,10 @@ class MetricsLog:
 
     @hookimpl
     def gsx_training_finished(self, run: Run) -> None:
-        """Close the file."""
+        """Closes the file."""
         self.close()
 
     def close(self) -> None:
-        """Close the file, however training ended."""
+        """Closes the file, however training ended."""
         if self.stream is not None:
             self.stream.close()

@@ -19,7 +19,7 @@ SHOWN = 6
 
 
 def write_pseudo_pictures(run: Run, options: EvalOptions) -> None:
-    """Render pseudo views of the last events from the trained model, beside what augmenters left to be looked at."""
+    """Renders pseudo views of the last events from the trained model, beside what augmenters left to be looked at."""
     folder = run.folder / "pseudo"
     entries: list[dict[str, Any]] = []
     latest = {path.stem.rpartition("_")[0]: path for path in sorted(folder.glob("*.safetensors"))}
@@ -35,14 +35,14 @@ def write_pseudo_pictures(run: Run, options: EvalOptions) -> None:
 
 
 def with_pictures(folder: Path, augmenter: str, views: list[PseudoView]) -> list[PseudoView]:
-    """One view for each picture that there is."""
+    """Returns one view for each picture that there is."""
     complete = [view for view in views if {"event", "scale", "kind"} <= view.provenance.keys()]
     by_name = {picture_name(augmenter, view): view for view in complete}
     return [view for name, view in by_name.items() if (folder / name).is_file()]
 
 
 def shown(run: Run, options: EvalOptions, augmenter: str, view: PseudoView) -> dict[str, Any]:
-    """Render one of them; returns its entry in the index."""
+    """Renders one of them; returns its entry in the index."""
     after = render(run, view.camera, options.tile_pixels).image
     made = picture_name(augmenter, view)
     name = made.replace(".png", "_after.png")

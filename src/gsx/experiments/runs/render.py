@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 
 def view_named(run: Run, name: str) -> View:
-    """A training or test view by name.
+    """Returns a training or test view by name.
 
     Raises:
         InputError: there is none; the nearest name is given.
@@ -44,7 +44,7 @@ def view_named(run: Run, name: str) -> View:
 
 @relieve_oversubscription()
 def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -> None:
-    """Write every test view at `zoom` times the training resolution as PNG.
+    """Writes every test view at `zoom` times the training resolution as PNG.
 
     Raises:
         InputError: no view is held out.
@@ -64,7 +64,7 @@ def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -
 
 @relieve_oversubscription()
 def render_orbit(run: Run, settings: Settings, path: Path, frames: int, fps: float, zoom: float) -> None:
-    """Animate a closed path around the scene."""
+    """Animates a closed path around the scene."""
     remove_partial(path.parent, below=False)
     pixels = settings.evaluation.tile_pixels
     cameras = (camera.zoom(zoom) for camera in orbit_cameras(run.scene, frames))
@@ -77,13 +77,13 @@ Draw = Callable[[Camera], Float[Tensor, "3 H W"]]
 
 
 def run_pictures(run: Run, settings: Settings) -> Draw:
-    """The model of a run, for any camera in the coordinates of the scene's files."""
+    """Returns a function that draws a run for any camera in the coordinates of the scene's files."""
     pixels, origin = settings.evaluation.tile_pixels, run.scene.origin
     return lambda camera: render(run, moved(camera, origin), pixels).image
 
 
 def file_pictures(path: Path, cameras: Sequence[Camera] = (), axes: str = AUTO) -> Draw:
-    """Return what draws the splats of a file over black, for any camera in its coordinates. cameras: some of those;
+    """Returns what draws the splats of a file over black, for any camera in its coordinates. cameras: some of those;
     axes: the file's.
 
     Raises:
@@ -101,7 +101,7 @@ def file_pictures(path: Path, cameras: Sequence[Camera] = (), axes: str = AUTO) 
 def render_path(
     way: CameraPath, draw: Draw, to: Path, movie: bool, zoom: float, run_folder: Path | None = None
 ) -> Path:
-    """Write the frames of a camera path: an animation, or a folder of numbered PNGs; returns which. run_folder: of the
+    """Writes the frames of a camera path: an animation, or a folder of numbered PNGs; returns which. run_folder: of the
     run that is drawn."""
     cameras = way.cameras(zoom)
     if movie:
@@ -123,7 +123,7 @@ def render_path(
 
 
 def without_others(folder: Path, pattern: str, names: Sequence[str], run_folder: Path | None) -> list[Path]:
-    """Remove pictures that were in a folder before, of other views or of a longer path, from one of a run's renders;
+    """Removes pictures that were in a folder before, of other views or of a longer path, from one of a run's renders;
     returns those that are left anywhere else."""
     others = sorted(set(folder.glob(pattern)) - {folder / name for name in names})
     if run_folder is None or folder.resolve().parent != run_folder.resolve() / "renders":

@@ -17,24 +17,24 @@ see points move by 0.1 px, which no reconstruction measures. Rounded poses are a
 
 
 def point_distance(cameras: Sequence[Camera], points: PointCloud) -> float:
-    """Return the median distance of the points from the first camera, scene units; 0 without points."""
+    """Returns the median distance of the points from the first camera, scene units; 0 without points."""
     if len(points) == 0:
         return 0.0
     return float(offsets_from(points.positions, cameras[0].centre).norm(dim=1).median())
 
 
 def rounding_extent(cameras: Sequence[Camera], points: PointCloud) -> float:
-    """Return the largest extent that is rounding: by the points' distances, or without points in scene units."""
+    """Returns the largest extent that is rounding: by the points' distances, or without points in scene units."""
     return ONE_PLACE * point_distance(cameras, points) if len(points) else SAME_PLACE
 
 
 def in_one_place(cameras: Sequence[Camera], points: PointCloud) -> bool:
-    """Return whether distances between cameras are rounding."""
+    """Returns whether distances between cameras are rounding."""
     return extent_of(cameras) <= rounding_extent(cameras, points)
 
 
 def measured(scene: Scene) -> Scene:
-    """Return the scene; if its training cameras stand in one place, its extent is 1.1 x the points' median distance.
+    """Returns the scene; if its training cameras stand in one place, its extent is 1.1 x the points' median distance.
 
     Without points, such a scene has the extent 0.
     """

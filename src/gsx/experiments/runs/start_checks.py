@@ -33,7 +33,7 @@ SIGMAS = 3.0
 
 
 def doubts_about(gaussians: Gaussians, scene: Scene, path: Path, trains: bool) -> list[str]:
-    """Return sentences on why a splat file may not belong to a scene, which also go to the log.
+    """Returns sentences on why a splat file may not belong to a scene, which also go to the log.
 
     trains: the file is trained on, so that all views count; otherwise test views do, where there are any.
 
@@ -54,7 +54,7 @@ def doubts_about(gaussians: Gaussians, scene: Scene, path: Path, trains: bool) -
 def refuse_nothing_in_view(
     gaussians: Gaussians, cameras: Sequence[Camera], kind: str, path: Path, origin: Origin = NO_ORIGIN
 ) -> None:
-    """Raise InputError if no splat reaches the picture of any camera. kind: of the cameras, in words; origin: added to
+    """Raises InputError if no splat reaches the picture of any camera. kind: of the cameras, in words; origin: added to
     coordinates in words."""
     if any(bool(reaching(gaussians, camera, SIGMAS).any()) for camera in cameras):
         return
@@ -67,7 +67,7 @@ def refuse_nothing_in_view(
 
 
 def reaching(gaussians: Gaussians, camera: Camera, sigmas: float) -> Bool[Tensor, "N"]:
-    """Return which splats are in front of a camera and at most so many of their deviations outside its picture."""
+    """Returns which splats are in front of a camera and at most so many of their deviations outside its picture."""
     x, y, z = camera.to_camera(gaussians.means).unbind(1)
     radius = sigmas * camera.focal * gaussians.log_scales.double().amax(1).exp() / z.clamp_min(1e-12)
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
@@ -76,7 +76,7 @@ def reaching(gaussians: Gaussians, camera: Camera, sigmas: float) -> Bool[Tensor
 
 
 def in_view_doubts(gaussians: Gaussians, cameras: Sequence[Camera], kind: str) -> Iterator[str]:
-    """Yield a sentence if hardly any splat has its middle in view of some camera."""
+    """Yields a sentence if hardly any splat has its middle in view of some camera."""
     some = Gaussians(**{name: spread(value, MOST_SPLATS) for name, value in vars(gaussians).items()})
     in_view = torch.zeros(len(some.means), dtype=torch.bool, device=some.means.device)
     for camera in cameras[:: max(1, -(-len(cameras) // MOST_VIEWS))]:
@@ -90,7 +90,7 @@ def in_view_doubts(gaussians: Gaussians, cameras: Sequence[Camera], kind: str) -
 
 
 def distance_doubts(gaussians: Gaussians, points: PointCloud) -> Iterator[str]:
-    """Yield a sentence if the scene's points are far from all splats; random points, which are grey, say nothing."""
+    """Yields a sentence if the scene's points are far from all splats; random points, which are grey, say nothing."""
     places = evident_points(points)
     if not len(places):
         return
@@ -104,22 +104,22 @@ def distance_doubts(gaussians: Gaussians, points: PointCloud) -> Iterator[str]:
 
 
 def evident_points(points: PointCloud) -> Float[Tensor, "n 3"]:
-    """Return some of the points that were measured, float64; none of scenes that have few, as random ones are grey."""
+    """Returns some of the points that were measured, float64; none of scenes that have few, as random ones are grey."""
     measured = points.positions[(points.colours != GREY).any(1)]
     return spread(measured, MOST_POINTS).double() if len(measured) >= LEAST_POINTS else measured[:0].double()
 
 
 def distance_from_points(means: Float[Tensor, "N 3"], places: Float[Tensor, "n 3"]) -> float:
-    """Return the median distance of a scene's points from the nearest of some means, scene units."""
+    """Returns the median distance of a scene's points from the nearest of some means, scene units."""
     return float(torch.cat([torch.cdist(part, means.double()).amin(1) for part in places.split(100)]).median())
 
 
 def middle(places: Float[Tensor, "N 3"], origin: Origin) -> str:
-    """Return the median of places that count from an origin, in words."""
+    """Returns the median of places that count from an origin, in words."""
     values = [value + by for value, by in zip(places.double().median(0).values.tolist(), origin, strict=True)]
     return "({:.8g}, {:.8g}, {:.8g})".format(*values)
 
 
 def spread(rows: Float[Tensor, "N ..."], most: int) -> Float[Tensor, "n ..."]:
-    """Return every so many rows, at most so many of them."""
+    """Returns every so many rows, at most so many of them."""
     return rows[:: max(1, -(-len(rows) // most))]

@@ -38,7 +38,7 @@ MIP_KERNEL = 0.1
 
 
 def starting_splats(settings: Settings) -> SplatContent | None:
-    """Return what the splat file holds that a run begins with, means in float64; None: it begins with points.
+    """Returns what the splat file holds that a run begins with, means in float64; None: it begins with points.
 
     Raises:
         ConfigError: axes are set without a file.
@@ -57,7 +57,7 @@ def starting_splats(settings: Settings) -> SplatContent | None:
 
 
 def in_scene(gaussians: Gaussians, scene: Scene) -> Gaussians:
-    """Return Gaussians of a file relative to the scene's origin.
+    """Returns Gaussians of a file relative to the scene's origin.
 
     A file that lies around (0, 0, 0), as other programs leave it, is taken as written around that origin.
     """
@@ -74,19 +74,19 @@ def in_scene(gaussians: Gaussians, scene: Scene) -> Gaussians:
 
 
 def origin_of_file(gaussians: Gaussians, scene: Scene) -> Origin:
-    """Return what is to be subtracted from the positions of a file: the scene's origin, unless that was done before."""
+    """Returns what to subtract from the positions of a file: the scene's origin, unless that was done before."""
     lies_there = any(scene.origin) and lies_around_zero(gaussians.means, scene.origin)
     return NO_ORIGIN if lies_there else scene.origin
 
 
 def lies_around_zero(positions: Float[Tensor, "P 3"], origin: Origin) -> bool:
-    """Return whether most positions are nearer to (0, 0, 0) than to an origin."""
+    """Returns whether most positions are nearer to (0, 0, 0) than to an origin."""
     offsets = positions - torch.tensor(origin, dtype=torch.float64)
     return float((positions.norm(dim=1) < offsets.norm(dim=1)).double().mean()) > 0.5
 
 
 def start_doubts(settings: Settings, scene: Scene, start: Gaussians | None) -> list[str]:
-    """Return why the splat file that a run begins with may not belong to its scene; see `doubts_about`.
+    """Returns why the splat file that a run begins with may not belong to its scene; see `doubts_about`.
 
     Raises:
         InputError: no splat is in view.
@@ -99,7 +99,7 @@ def start_doubts(settings: Settings, scene: Scene, start: Gaussians | None) -> l
 
 
 def go_on_from(backbone: Backbone[Any], gaussians: Gaussians, name: str) -> None:
-    """Give Gaussians to a backbone in place of what it was built with.
+    """Gives Gaussians to a backbone in place of what it was built with.
 
     Raises:
         ConfigError: it cannot go on from any.
@@ -111,7 +111,7 @@ def go_on_from(backbone: Backbone[Any], gaussians: Gaussians, name: str) -> None
 
 
 def in_front_of(camera: Camera) -> Gaussians:
-    """One splat on the camera's axis: it stands in until a checkpoint is read."""
+    """Returns one splat on the camera's axis: it stands in until a checkpoint is read."""
     ahead = camera.centre + camera.rotation[2].to(camera.centre)
     return Gaussians(
         means=ahead[None].float(),
@@ -124,12 +124,12 @@ def in_front_of(camera: Camera) -> Gaussians:
 
 
 def one_point(gaussians: Gaussians) -> PointCloud:
-    """The first of them as a point: a backbone is built from points, and is given the splats then."""
+    """Returns the first Gaussian as a point: a backbone is built from points, and gets the splats afterwards."""
     return PointCloud(positions=gaussians.means[:1], colours=torch.full((1, 3), 128, dtype=torch.uint8))
 
 
 def rules_of(path: Path) -> RasterSettings:
-    """What a splat file is to be drawn by, as it says.
+    """Returns the rules that a splat file states for its drawing.
 
     Raises:
         InputError: it cannot be read.
@@ -138,7 +138,7 @@ def rules_of(path: Path) -> RasterSettings:
 
 
 def composition_of(path: Path, overrides: Sequence[str]) -> list[str]:
-    """Words of the command line that evaluate a splat file on a scene, drawn as it is.
+    """Returns words of the command line that evaluate a splat file on a scene, drawn as it is.
 
     Raises:
         ConfigError: an override is about what the file is not, or no scene is given.

@@ -1,7 +1,7 @@
-"""Trackers: listeners that tell other programs of a run. A tracker may fail; the run goes on without it.
+"""Trackers: listeners that report a run to other programs. A tracker may fail; the run goes on without it.
 
 A factory takes the options and returns an object with `@hookimpl` events. It checks what can be checked before training
-begins, and raises ConfigError; whatever its events raise is warned of once, and the tracker hears no more.
+begins, and raises ConfigError; the first error of its events is logged, and it gets no more.
 """
 
 import logging
@@ -20,7 +20,7 @@ logger = logging.getLogger(__name__)
 
 
 def build_trackers(trackers: Mapping[str, Chosen]) -> "list[Tracking]":
-    """The chosen trackers as listeners.
+    """Returns the chosen trackers as listeners.
 
     Raises:
         ConfigError: a tracker lacks a package or cannot work with its options.
@@ -29,7 +29,7 @@ def build_trackers(trackers: Mapping[str, Chosen]) -> "list[Tracking]":
 
 
 class Tracking:
-    """Listener: passes the events of a run on to one tracker, but for vetoes, until the tracker fails.
+    """Listener that passes the events of a run on to one tracker, but for vetoes, until the tracker fails.
 
     Raises:
         TypeError, pluggy.PluginValidationError: the tracker has a hook that is unmarked or unknown.
@@ -37,7 +37,7 @@ class Tracking:
 
     def __init__(self, name: str, tracker: object) -> None:
         refuse_unmarked(tracker)
-        self.name, self.begun, self.lost = name, False, ""
+        self.name, self.started, self.lost = name, False, ""
         self.manager = pluggy.PluginManager(GROUP)  # of its own, so that its errors do not reach other listeners
         self.manager.add_hookspecs(Hooks)
         self.manager.register(tracker)
@@ -45,65 +45,71 @@ class Tracking:
 
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
-        """Pass on."""
-        self.begun = True
-        self.tell("gsx_run_started", run)
+        """Passes on."""
+        self.started = True
+        self.call("gsx_run_started", run)
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
-        """Pass on."""
-        self.tell("gsx_step_finished", run, step=step)
+        """Passes on."""
+        self.call("gsx_step_finished", run, step=step)
 
     @hookimpl
     def gsx_training_finished(self, run: Run) -> None:
-        """Pass on."""
-        self.tell("gsx_training_finished", run)
+        """Passes on."""
+        self.call("gsx_training_finished", run)
         if not run.complete:
             self.remind()
 
     @hookimpl
     def gsx_evaluated(self, run: Run, evaluation: dict[str, Any]) -> None:
-        """Pass on."""
-        self.tell("gsx_evaluated", run, evaluation=evaluation)
+        """Passes on."""
+        self.call("gsx_evaluated", run, evaluation=evaluation)
 
     @hookimpl
     def gsx_run_finished(self, run: Run) -> None:
-        """Pass on."""
-        self.tell("gsx_run_finished", run)
+        """Passes on."""
+        self.call("gsx_run_finished", run)
         self.remind()
 
     @hookimpl
     def gsx_run_failed(self, run: Run, reason: str) -> None:
-        """Pass on, unless the tracker has not heard of the run yet."""
-        self.tell("gsx_run_failed", run, reason=reason)
+        """Passes on, unless the run has not started yet."""
+        self.call("gsx_run_failed", run, reason=reason)
         self.remind()
 
-    def tell(self, hook: str, run: Run, **more: Any) -> None:
-        """Call the tracker's hook; its first error is the last thing that is heard of it."""
-        if self.lost or not self.begun:
+    def call(self, hook: str, run: Run, **more: Any) -> None:
+        """Calls the tracker's hook; its first error is logged and ends its tracking."""
+        if self.lost or not self.started:
             return
         try:
             getattr(self.manager.hook, hook)(run=run, **more)
         except Exception as error:  # a full disk, a server that is down, a mistake of a third party
             self.lost = f"step {run.step}"
-            reason = f"{type(error).__name__}: {first_line(error)}"
-            logger.warning("tracker %s failed at %s (%s): the run goes on without it", self.name, self.lost, reason)
+            logger.warning(
+                "tracker %s failed at %s (%s: %s): the run goes on without it",
+                *(self.name, self.lost, type(error).__name__, first_line(error)),
+            )
 
     def remind(self) -> None:
-        """Say at the end that something is missing."""
+        """Logs at the end that something is missing."""
         if self.lost:
             logger.warning("tracker %s is incomplete from %s on; the run folder has everything", self.name, self.lost)
 
 
 @contextmanager
-def telling_of_failure(run: Run, plugins: Plugins) -> Iterator[None]:
-    """Listeners hear of what ends a run before its time; an error of theirs does not hide it."""
+def announce_failure(run: Run, plugins: Plugins) -> Iterator[None]:
+    """Announces to listeners what ends a run before its time; an error of theirs does not hide it."""
     try:
         yield
     except BaseException as error:
-        reason = str(error) if isinstance(error, TrainingError) else f"{type(error).__name__}: {error}"
         try:
-            plugins.emit.gsx_run_failed(run=run, reason=reason)
+            plugins.emit.gsx_run_failed(run=run, reason=reason_of(error))
         except Exception as another:
-            logger.warning("a listener failed while it heard of the run's failure: %s", first_line(another))
+            logger.warning("a listener of the run's failure failed: %s", first_line(another))
         raise
+
+
+def reason_of(error: BaseException) -> str:
+    """Returns why a run failed."""
+    return str(error) if isinstance(error, TrainingError) else f"{type(error).__name__}: {error}"

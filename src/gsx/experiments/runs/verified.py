@@ -23,7 +23,7 @@ LONG = 200
 
 
 def verified(scene: Scene) -> Scene:
-    """The scene, whose photographs and masks can be decoded; which ones could be is remembered by name, size and time.
+    """Returns the scene if its photographs and masks can be decoded; remembers them by name, size and time.
 
     Raises:
         InputError: some are damaged or missing.
@@ -45,7 +45,7 @@ def verified(scene: Scene) -> Scene:
 
 
 def remembered(paths: Sequence[Path]) -> Path:
-    """The file that says that these, as they are now, could be decoded.
+    """Returns the file that says that these, as they are now, could be decoded.
 
     Raises:
         InputError: one cannot be looked at.
@@ -58,7 +58,7 @@ def remembered(paths: Sequence[Path]) -> Path:
 
 
 def refuse_damaged(paths: Sequence[Path]) -> None:
-    """Raise InputError naming the files that cannot be decoded; several are at a time."""
+    """Raises InputError naming the files that cannot be decoded; several are at a time."""
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         problems = [problem for problem in pool.map(problem_of, paths) if problem]
     if problems:
@@ -67,7 +67,7 @@ def refuse_damaged(paths: Sequence[Path]) -> None:
 
 
 def problem_of(path: Path) -> str:
-    """Why a file cannot be decoded; empty if it can."""
+    """Returns why a file cannot be decoded; empty if it can."""
     try:
         read_image(path)
     except InputError as error:

@@ -27,12 +27,12 @@ INDEX = "frames.json"
 
 
 def is_video(path: Path) -> bool:
-    """Whether it is called as videos are."""
+    """Returns whether a file has the name of a video."""
     return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
 def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
-    """A folder below `output` with the sharpest frame of each of `count` stretches of a video; made once.
+    """Returns a folder below `output` with the sharpest frame of each of `count` stretches of a video; made once.
 
     Raises:
         ConfigError: PyAV is not installed.
@@ -52,12 +52,12 @@ def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
 
 
 def chosen(folder: Path, made_of: Sequence[Any]) -> bool:
-    """Whether a folder holds the frames of that."""
+    """Returns whether a folder holds these frames."""
     return (folder / INDEX).exists() and bool(read_json(folder / INDEX) == made_of)
 
 
 def choose(path: Path, folder: Path, count: int, made_of: Sequence[Any]) -> None:
-    """Write the frames of a video to a folder, and then what they are of.
+    """Writes the frames of a video to a folder, and then what they are of.
 
     Raises:
         InputError: the video cannot be read, or is too short.
@@ -75,7 +75,7 @@ def choose(path: Path, folder: Path, count: int, made_of: Sequence[Any]) -> None
 
 
 def frames_in(path: Path) -> Iterator[Any]:
-    """Frames of the first video stream, decoded one after the other.
+    """Yields frames of the first video stream, decoded one after the other.
 
     Raises:
         InputError: it cannot be read.
@@ -93,7 +93,7 @@ def frames_in(path: Path) -> Iterator[Any]:
 
 
 def sharpest(path: Path, total: int, stretches: int) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
-    """(number, pixels) of the sharpest frame of each stretch, in order."""
+    """Yields (index, pixels) of the sharpest frame of each stretch, in order."""
     best: tuple[float, int, Any] | None = None
     for number, frame in enumerate(frames_in(path)):
         if best is not None and number * stretches // total > best[1] * stretches // total:
@@ -107,17 +107,17 @@ def sharpest(path: Path, total: int, stretches: int) -> Iterator[tuple[int, UInt
 
 
 def quarter_turns(frame: Any) -> int:
-    """Return the quarter turns, counterclockwise, that bring a frame upright: phones film as the sensor lies."""
+    """Returns the quarter turns, counterclockwise, that bring a frame upright: phones film as the sensor lies."""
     return round(getattr(frame, "rotation", 0) / 90)
 
 
 def upright_pixels(frame: Any) -> UInt8[np.ndarray, "H W 3"]:
-    """Return a frame as players show it."""
+    """Returns a frame as players show it."""
     return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), quarter_turns(frame)))
 
 
 def sharpness(grey: Float[np.ndarray, "H W"]) -> float:
-    """Variance of the Laplacian: blur takes it away (Pech-Pacheco et al. 2000)."""
+    """Returns the variance of the Laplacian, which blur lowers (Pech-Pacheco et al. 2000)."""
     inner = grey[1:-1, 1:-1]
     laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * inner
     return float(laplacian.var())

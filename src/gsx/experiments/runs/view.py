@@ -35,7 +35,7 @@ class Watched:
         self.looked = time.monotonic()
 
     def refresh(self) -> bool:
-        """Whether there was something newer, which is shown from now on."""
+        """Shows a newer checkpoint; returns whether there was one."""
         if time.monotonic() - self.looked < EVERY:
             return False
         self.looked = time.monotonic()
@@ -50,17 +50,17 @@ class Watched:
         return True
 
     def faster(self, raster: RasterSettings) -> None:
-        """Draw by these rules from now on."""
+        """Draws by these rules from now on."""
         self.run.raster = raster
 
     def told(self) -> str:
-        """How it stands, in words."""
+        """Returns the state of the run in words."""
         return f"{told_of(self.run)}, {state_of(read_run(self.run.folder))[0]}"
 
 
 @relieve_oversubscription()
 def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Callable[[str], None]) -> None:
-    """Show a run until Ctrl-C.
+    """Shows a run until Ctrl-C.
 
     Raises:
         InputError, CheckpointError: there is nothing to show, or the port is taken.
@@ -77,7 +77,7 @@ def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Cal
 
 @relieve_oversubscription()
 def view_file(path: Path, axes: str, host: str, port: int, announce: Callable[[str], None]) -> None:
-    """Show a splat file until Ctrl-C; axes: the file's. Errors as `view_run`."""
+    """Shows a splat file until Ctrl-C; axes: the file's. Errors as `view_run`."""
     gaussians, origin = read_around(path, axes)
     if not len(gaussians.means):
         raise InputError(f"{path} holds no splats: choose another file")

@@ -17,16 +17,7 @@ from gsx.core.files import read_json, replace_file, replace_text, write_json
 from gsx.core.plugins import hookimpl
 from gsx.core.training import checkpoint
 from gsx.core.training.run import Run, StepResult
-from gsx.engine.cache import (
-    cache_folder,
-    content_key,
-    enlist,
-    file_stamp,
-    make_folder,
-    source_revision,
-    trim,
-    whole,
-)
+from gsx.engine.cache import cache_folder, content_key, enlist, file_stamp, make_folder, source_revision, trim, whole
 from gsx.engine.machine import machine_stamp
 from gsx.experiments.run_folder.run_key import scene_stamp, trained
 
@@ -41,7 +32,7 @@ SHARES = (10 / 40, 15 / 40, 20 / 40, 22 / 40, 30 / 40)
 
 
 def common_steps(run: Run) -> int:
-    """Steps that the run shares with its baseline: up to the first pseudo views, or all of them."""
+    """Returns the steps that a run shares with its baseline: up to the first pseudo views, or all of them."""
     return min([run.iterations, *(augmenter.begins() for augmenter in run.augmenters.values())])
 
 
@@ -51,7 +42,7 @@ def warm_start_folder(run: Run, idle: Collection[str], plugins: Mapping[str, str
     parts = (
         json.dumps(trained(without_augmenters(run.config), idle), sort_keys=True, default=str),
         scene_stamp(run.config),  # test views are among the lines that are kept with a state
-        seen_by(run),
+        training_data_digest(run),
         source_revision(),
         sorted(plugins.items()),
         machine,
@@ -60,12 +51,12 @@ def warm_start_folder(run: Run, idle: Collection[str], plugins: Mapping[str, str
 
 
 def without_augmenters(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The composition of the baseline."""
+    """Returns the composition of the baseline."""
     return {key: value for key, value in config.items() if key not in ("augmenter", "regenerator", "checks")}
 
 
-def seen_by(run: Run) -> str:
-    """A digest of what the run is trained on: cameras, points, and the files of photographs."""
+def training_data_digest(run: Run) -> str:
+    """Returns a digest of what a run is trained on: cameras, points, and the files of photographs."""
     digest = hashlib.sha256(run.scene.points.positions.numpy().tobytes())
     digest.update(run.scene.points.colours.numpy().tobytes())
     for view in run.scene.train:
@@ -77,7 +68,7 @@ def seen_by(run: Run) -> str:
 
 
 def adopt(run: Run, folder: Path) -> None:
-    """Bring a new run to the latest state that it has in common with an earlier one, if there is any."""
+    """Brings a new run to the latest state that it has in common with an earlier one, if there is any."""
     common = common_steps(run)
     for sidecar in reversed([path for path in checkpoint.sidecars(folder) if checkpoint.step_of(path) <= common]):
         try:
@@ -95,7 +86,7 @@ def adopt(run: Run, folder: Path) -> None:
 
 
 def branch(run: Run, sidecar: Path) -> None:
-    """Start from a kept state: its checkpoint and its lines of metrics.jsonl become the run's own."""
+    """Starts from a kept state: copies its checkpoint and its lines of metrics.jsonl."""
     own = run.folder / "checkpoints"
     own.mkdir(parents=True, exist_ok=True)
     tensors, lines = sidecar.with_suffix(".safetensors"), read_json(lines_at(sidecar))["lines"]
@@ -108,22 +99,22 @@ def branch(run: Run, sidecar: Path) -> None:
 
 
 def lines_at(sidecar: Path) -> Path:
-    """File of the lines of metrics.jsonl up to a kept state."""
+    """Returns the file of the lines of metrics.jsonl up to a kept state."""
     return sidecar.with_name(f"lines_{sidecar.stem}.json")
 
 
 class WarmStartKeeper:
-    """Listener: keeps states that other runs can branch from."""
+    """Listener that keeps states for other runs to branch from."""
 
     def __init__(self, folder: Path, gigabytes: float, steps: Collection[int] = ()) -> None:
         self.folder, self.gigabytes, self.steps = folder, gigabytes, steps
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
-        """Keep this one if it is common ground and not kept yet; a cache that cannot be written is no error."""
-        where_variants_begin = (round(share * run.iterations) for share in SHARES)
-        wanted = {*(self.steps or where_variants_begin), common_steps(run)}
-        if run.step not in wanted or run.step > common_steps(run) or run.complete:
+        """Keeps this state if runs can share it; a cache that cannot be written is no error."""
+        common = common_steps(run)
+        steps = {*(self.steps or (round(share * run.iterations) for share in SHARES)), common}
+        if run.step not in steps or run.step > common or run.complete:
             return
         try:
             self.keep(run)
@@ -131,7 +122,7 @@ class WarmStartKeeper:
             logger.warning("init=warm_start: the state of step %d is not kept (%s)", run.step, error)
 
     def keep(self, run: Run) -> None:
-        """Write the state where other runs look for it."""
+        """Writes the state where other runs look for it."""
         folder = make_folder(self.folder)
         kept = [path for path in checkpoint.sidecars(folder) if checkpoint.step_of(path) == run.step]
         if kept and whole(lines_at(kept[0])):
