@@ -294,7 +294,6 @@ def test_a_run_is_trained_and_looked_at_by_windows(tmp_path: Path) -> None:
     ("changes", "message"),
     [
         ({"dilation": 0.05}, "above 1/12 px"),
-        ({"evaluation": "bfloat16"}, "not evaluation=bfloat16"),
         ({"pixel": "square"}, "rasterizer.pixel is 'square'; choose sample, window"),
     ],
 )

@@ -62,7 +62,6 @@ def rules_of(settings: RasterSettings, channels: int, absolute: bool, evaluation
         alpha_min=settings.alpha_min,
         alpha_max=settings.alpha_max,
         stop=settings.transmittance_stop,
-        exponent=settings.exponent,
         evaluation=evaluation,
         absolute=absolute,
         device=device,
@@ -332,7 +331,7 @@ def composite_compiled(
 
 def takes(settings: RasterSettings, channels: int, intersections: int, max_weight: bool, device: str) -> bool:
     """Whether this picture goes the compiled way: asked for, possible here, and nothing only the eager path does."""
-    if settings.path != "compiled" or settings.accumulation in ("bfloat16", "float16"):
+    if settings.path != "compiled":
         return False
     if channels > MOST_CHANNELS or max_weight or intersections == 0:
         return False

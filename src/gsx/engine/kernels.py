@@ -41,7 +41,6 @@ class Rules:
     alpha_min: float
     alpha_max: float
     stop: float
-    exponent: str
     evaluation: torch.dtype
     absolute: bool
     device: str
@@ -89,25 +88,17 @@ def cut_exp(x: Tensor, rules: Rules) -> Tensor:
     return torch.where(x >= rules.least, value, 0.0)
 
 
-def log_alpha(
-    row: Float[Tensor, "F B 1 *L"], x: Float[Tensor, "P *one"], y: Float[Tensor, "P *one"], form: str
-) -> Tensor:
-    """ln alpha of one entry at every pixel, [B P *L]; the columns of a row are those of `make_rows`."""
-    a, b, c, d, e, log_opacity = row[: ROW - 1]
-    if form == "squares":
-        s, r = a * x + (b * y + c), d * y + e
-        return log_opacity - r * r - s * s
-    if form == "direct":
-        dx, dy = x - c, y - e
-        s, r = a * dx + b * dy, d * dy
-        return log_opacity - r * r - s * s
-    return log_opacity - (a * x + (b * y + c)) * x - (d * y + e) * y
+def log_alpha(row: Float[Tensor, "F B 1 *L"], x: Float[Tensor, "P *one"], y: Float[Tensor, "P *one"]) -> Tensor:
+    """Returns ln alpha of one entry at every pixel, [B P *L]; the columns of a row are those of `make_rows`."""
+    u0, u1, k0, u2, k1, log_opacity = row[: ROW - 1]
+    s, r = u0 * x + (u1 * y + k0), u2 * y + k1
+    return log_opacity - r * r - s * s
 
 
 def gaussian(row: Tensor, x: Tensor, y: Tensor, rules: Rules) -> Tensor:
     """o exp(-s^2 - r^2), zero below alpha_min, before the clamp at alpha_max; [B P *L]."""
     row, x, y = row.to(rules.evaluation), x.to(rules.evaluation), y.to(rules.evaluation)
-    return cut_exp(log_alpha(row, x, y, rules.exponent), rules)
+    return cut_exp(log_alpha(row, x, y), rules)
 
 
 def clamped(value: Tensor, row: Float[Tensor, "F B 1 *L"]) -> Tensor:
@@ -263,7 +254,7 @@ def sums_of(
     sums = [slope.sum(2), *((slope * b).sum(2) for b in (x, y, *products.unbind(0)))]
     sums += [(weight * g[:, None]).sum(2) for g in gradient[:-1]]
     if rules.absolute:
-        sums += absolute_moments(rules, rows, slope, x, y)
+        sums += absolute_moments(rows, slope, x, y)
     return torch.stack(sums, 2)
 
 
@@ -290,16 +281,12 @@ def gradients(
 
 
 def absolute_moments(
-    rules: Rules, rows: Float[Tensor, "B K F *L"], slope: Float[Tensor, "B K P *L"], x: Tensor, y: Tensor
+    rows: Float[Tensor, "B K F *L"], slope: Float[Tensor, "B K P *L"], x: Tensor, y: Tensor
 ) -> list[Float[Tensor, "B K *L"]]:
     """Sums over pixels of |d loss / d mean| per axis: minus the slope of ln alpha along x and y."""
-    a, b, c, d, e = (column[:, :, None] for column in rows[:, :, :5].unbind(2))
-    if rules.exponent == "expanded":
-        by_x, by_y = 2 * a * x + b * y + c, b * x + 2 * d * y + e
-    else:
-        shift = (c, e) if rules.exponent == "squares" else (-(a * c + b * e), -d * e)
-        s, r = a * x + b * y + shift[0], d * y + shift[1]
-        by_x, by_y = 2 * a * s, 2 * (b * s + d * r)
+    u0, u1, k0, u2, k1 = (column[:, :, None] for column in rows[:, :, :5].unbind(2))
+    s, r = u0 * x + u1 * y + k0, u2 * y + k1
+    by_x, by_y = 2 * u0 * s, 2 * (u1 * s + u2 * r)
     return [(slope * by_x).abs().sum(2), (slope * by_y).abs().sum(2)]
 
 
@@ -309,36 +296,17 @@ def absolute_moments(
 def make_rows(
     table: Float[Tensor, "N F"], places: Int[Tensor, "S K *L"], centre: Float[Tensor, "S 2 1 *L"], rules: Rules
 ) -> Float[Tensor, "S K F *L"]:
-    """What blending reads of every entry. `table`: mean x, mean y, u0, u1, u2, ln opacity, channels of every splat.
+    """Gathers what blending reads of every entry.
 
-    The exponent's columns, in tile-centred coordinates, with ln alpha = ln o - ...
-    squares: u0, u1, k0, u2, k1 for (u0 x + u1 y + k0)^2 + (u2 y + k1)^2; direct: u0, u1, mean x, u2, mean y;
-    expanded: the polynomial's coefficients of x^2, x y, x, y^2, y.
-
-    Last, behind the channels, what `shapes_of` needs beside them.
+    Columns: u0, u1, k0, u2, k1 of ln alpha = ln o - (u0 x + u1 y + k0)^2 - (u2 y + k1)^2 in tile-centred coordinates;
+    ln o; the largest alpha; the channels; the mean. `table`: mean x, mean y, u0, u1, u2, ln o, channels of every splat.
     """
     columns = [table[places, f] for f in range(table.shape[1])]
     x, y = columns[0] - centre[:, 0], columns[1] - centre[:, 1]
     u0, u1, u2, log_opacity = columns[2:TABLE]
     highest = rules.alpha_max * (places < table.shape[0] - 1).to(table.dtype)
     k0, k1 = -(u0 * x + u1 * y), -u2 * y
-    tail: list[Tensor] = []
-    if rules.exponent == "squares":
-        head, tail = [u0, u1, k0, u2, k1, log_opacity], [x, y]
-    elif rules.exponent == "direct":
-        head = [u0, u1, x, u2, y, log_opacity]
-    else:
-        cross, tail = 2 * (u1 * k0 + u2 * k1), [x, y, u0, u1, u2]
-        head = [u0 * u0, 2 * u0 * u1, 2 * u0 * k0, u1 * u1 + u2 * u2, cross, log_opacity - k0 * k0 - k1 * k1]
-    return torch.stack([*head, highest, *columns[TABLE:], *tail], 2)
-
-
-def shapes_of(rows: Float[Tensor, "S K F *L"], rules: Rules) -> tuple[Tensor, ...]:
-    """(x, y, u0, u1, u2) of every entry, [S K *L], its mean counted from the middle of the tile."""
-    columns = rows.unbind(2)
-    if rules.exponent == "squares":
-        return (*columns[-2:], columns[0], columns[1], columns[3])
-    return (columns[2], columns[4], columns[0], columns[1], columns[3]) if rules.exponent == "direct" else columns[-5:]
+    return torch.stack([u0, u1, k0, u2, k1, log_opacity, highest, *columns[TABLE:], x, y], 2)
 
 
 def entry_gradients(
@@ -346,7 +314,8 @@ def entry_gradients(
 ) -> Float[Tensor, "S K *L V"]:
     """Gradient of (mean x, mean y, u0, u1, u2, ln o, channels ...) for every entry from its moments, numbers of an
     entry side by side."""
-    x, y, u0, u1, u2 = shapes_of(rows, rules)
+    columns = rows.unbind(2)
+    (x, y), u0, u1, u2 = columns[-2:], columns[0], columns[1], columns[3]
     k0, k1 = -(u0 * x + u1 * y), -u2 * y
     one, mx, my, mxx, mxy, myy, *others = moments.unbind(2)
     by_k0, by_k1 = -2 * (u0 * mx + u1 * my + k0 * one), -2 * (u2 * my + k1 * one)

@@ -1,6 +1,6 @@
 """Front-to-back blending over tiles and its gradient, in O(pairs + pixels) memory.
 
-How ln alpha is written is chosen in exponent.py, in which number formats the work is done in precision.py.
+exponent.py writes ln alpha, precision.py names the number formats.
 
 The list of a tile is cut into blocks of K splats, the last one padded. Tiles are taken in batches of similar list
 length; a batch blends one block of each of its tiles at a time, front to back; tiles whose list has ended or whose
@@ -16,10 +16,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsx.core.rasterizer.exponent import EXPONENTS, Exponent
+from gsx.core.rasterizer.exponent import (
+    absolute_gradient,
+    exponent_rows,
+    gradient_by_splat,
+    log_alphas,
+    row_gradient,
+)
 from gsx.core.rasterizer.grid import TileGrid, pixel_centres
 from gsx.core.rasterizer.intersections import TileIntersections
-from gsx.core.rasterizer.precision import Precision, power_of_two_above
+from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.settings import NOTHING, RasterSettings
 from gsx.core.shapes import Float, Int
 
@@ -61,13 +67,12 @@ class Tables:
     offsets: Float[Tensor, "S K 2"]
     """Mean relative to the tile's centre, px."""
     channels: Float[Tensor, "S K C"]
-    basis: Float[Tensor, "Q P"]
-    """What the exponent reads of the pixels of a tile, in the dtype of evaluation."""
+    basis: Float[Tensor, "3 P"]
+    """(x, y, 1) at the pixels of a tile, in the dtype of evaluation."""
     inside: Float[Tensor, "T P"]
     """1 at pixels of the raster, 0 at those of border tiles beyond it."""
     settings: RasterSettings
     precision: Precision
-    exponent: Exponent
 
 
 def make_tables(
@@ -83,20 +88,19 @@ def make_tables(
     features = torch.cat([means, conic_factors, log_opacities[:, None], channels, torch.ones_like(means[:, :1])], 1)
     nothing = means.new_zeros(1, features.shape[1])
     nothing[0, 5] = NOTHING
-    precision, exponent = Precision.of(settings, means.dtype), EXPONENTS[settings.exponent]
+    precision = Precision.of(settings, means.dtype)
     table = torch.cat([features, nothing]).to(precision.exact).index_select(0, blocks.splats.view(-1))
     table = table.view(*blocks.splats.shape, features.shape[1])
     offsets = table[..., :2] - grid.centres(blocks.tiles, table)[:, None]
     one = means.new_ones(1, grid.height, grid.width, dtype=precision.accumulation)
     return Tables(
-        rows=exponent.rows(offsets, table[..., 2:5], table[..., 5]),
+        rows=exponent_rows(offsets, table[..., 2:5], table[..., 5]),
         offsets=offsets,
         channels=table[..., 6:].to(precision.accumulation).contiguous(),
-        basis=exponent.basis(pixel_centres(grid.tile, means.new_empty(0, dtype=precision.evaluation))),
+        basis=pixel_centres(grid.tile, means.new_empty(0, dtype=precision.evaluation)),
         inside=grid.to_tiles(one)[:, 0],
         settings=settings,
         precision=precision,
-        exponent=exponent,
     )
 
 
@@ -139,7 +143,7 @@ def stop_(alpha: Float[Tensor, "B K P"], transmittance: Float[Tensor, "B K_plus_
 
 def blend(tables: Tables, front: Front) -> tuple[Float[Tensor, "B P C"], Float[Tensor, "B P"], Tensor]:
     """Light that the blocks add, the transmittance behind them, and the blending weights [B, K, P]."""
-    log_alpha, _ = tables.exponent.log_alphas(tables.rows.index_select(0, front.blocks), tables.basis)
+    log_alpha, _ = log_alphas(tables.rows.index_select(0, front.blocks), tables.basis)
     alpha = alphas_(log_alpha.exp_(), tables.settings).to(tables.precision.accumulation)
     transmittance = transmittances(alpha, front.transmittance)
     stop_(alpha, transmittance, tables.settings.transmittance_stop)
@@ -172,7 +176,7 @@ class FrontGradient:
     """Gradients of B blocks, and the colour of the blocks and all behind them."""
 
     rows: Float[Tensor, "B K 6"]
-    """As `Exponent.gradient` has it."""
+    """As `row_gradient` returns it."""
     channels: Float[Tensor, "B K C"]
     absolute: Float[Tensor, "B K 2"] | None
     """Sum over pixels of the absolute gradient of the mean, per axis."""
@@ -184,7 +188,7 @@ def front_gradient(
 ) -> FrontGradient:
     """Gradient of a front; `rest` is the colour behind it, weighted by the gradient of the picture."""
     rows = tables.rows.index_select(0, front.blocks)
-    log_alpha, kept = tables.exponent.log_alphas(rows, tables.basis)
+    log_alpha, kept = log_alphas(rows, tables.basis)
     gaussian, exact = log_alpha.exp_(), tables.precision.exact
     alpha = alphas_(gaussian.clone(), tables.settings).to(tables.precision.accumulation)
     transmittance = transmittances(alpha, front.transmittance)
@@ -197,9 +201,9 @@ def front_gradient(
     unclamp_(slope, gaussian, tables.settings)
     slope = slope.to(exact)  # sums over pixels are exact
     return FrontGradient(
-        rows=tables.exponent.gradient(slope, kept, rows, tables.basis),
+        rows=row_gradient(slope, kept, tables.basis),
         channels=torch.bmm(weight.to(exact), gradient.mT.to(exact)),
-        absolute=tables.exponent.absolute(slope, kept, rows, tables.basis) if absolute else None,
+        absolute=absolute_gradient(slope, kept, rows) if absolute else None,
         rest=behind[:, 0],
     )
 
@@ -276,16 +280,6 @@ def sum_by_splat(values: Float[Tensor, "E V"], splats: Int[Tensor, "E"], count: 
     return torch.segment_reduce(values[order], "sum", lengths=lengths, axis=0, initial=0)
 
 
-def in_units(
-    gradient: Float[Tensor, "T C P"], precision: Precision
-) -> tuple[Float[Tensor, "T C P"], Float[Tensor, ""] | None]:
-    """The picture's gradient in the dtype of accumulation, where that is narrow in units of its largest pixel sum."""
-    if not precision.narrow or not gradient.numel():
-        return gradient.to(precision.accumulation), None
-    unit = power_of_two_above(gradient.abs().sum(1).amax())
-    return (gradient / unit).to(precision.accumulation), unit
-
-
 class Composite(torch.autograd.Function):
     """See `composite` for the arguments."""
 
@@ -293,8 +287,7 @@ class Composite(torch.autograd.Function):
     def forward(ctx, means, conic_factors, log_opacities, channels, absgrad, blocks, grid, settings, max_weights):
         tables = make_tables(means, conic_factors, log_opacities, channels, blocks, grid, settings)
         keep = any(ctx.needs_input_grad)
-        with tables.precision.products():
-            pictures, fronts = blend_all(tables, blocks, keep, max_weights)
+        pictures, fronts = blend_all(tables, blocks, keep, max_weights)
         if keep:
             ctx.kept = (tables, blocks, grid, fronts, len(means), absgrad is not None)
         return grid.to_raster(pictures).to(means.dtype)
@@ -302,13 +295,12 @@ class Composite(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient):
         tables, blocks, grid, fronts, count, absolute = ctx.kept
-        tiles, unit = in_units(grid.to_tiles(gradient), tables.precision)
-        with tables.precision.products():
-            rows, channels, means = all_gradients(tables, fronts, tiles, absolute)
-        by_splat = tables.exponent.by_splat(rows, tables.rows, tables.offsets)
+        tiles = grid.to_tiles(gradient).to(tables.precision.accumulation)
+        rows, channels, means = all_gradients(tables, fronts, tiles, absolute)
+        by_splat = gradient_by_splat(rows, tables.rows, tables.offsets)
         parts = [by_splat, channels[..., :-1], *([] if means is None else [means])]
         total = sum_by_splat(torch.cat(parts, -1).flatten(0, 1), blocks.splats.view(-1), count + 1)[:-1]
-        total = (total if unit is None else total * unit).to(gradient.dtype)
+        total = total.to(gradient.dtype)
         width = 6 + channels.shape[2] - 1
         absgrad = total[:, width:] if absolute else None
         return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], absgrad, None, None, None, None)
@@ -331,13 +323,4 @@ def composite(
     `absgrad` is a leaf of zeros whose gradient becomes, per axis, the sum over pixels of the absolute gradient of the
     mean (px). `max_weights` receives the largest blending weight of each list entry.
     """
-    if not Precision.of(settings, means.dtype).narrow:
-        return Composite.apply(
-            means, conic_factors, log_opacities, channels, absgrad, blocks, grid, settings, max_weights
-        )
-    # 16 bits hold neither a depth of 1e5 nor a colour of 1e-6: blend what lies within 1
-    units = power_of_two_above(torch.cat([channels, channels.new_zeros(1, channels.shape[1])]).detach().abs().amax(0))
-    blended = Composite.apply(
-        means, conic_factors, log_opacities, channels / units, absgrad, blocks, grid, settings, max_weights
-    )
-    return blended * torch.cat([units, units.new_ones(1)])[:, None, None]
+    return Composite.apply(means, conic_factors, log_opacities, channels, absgrad, blocks, grid, settings, max_weights)

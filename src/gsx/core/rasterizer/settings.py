@@ -20,14 +20,12 @@ CHOICES = {
     "zoomed": ("plain", "magnified", "resampled"),
     "path": ("auto", "eager", "compiled"),
     "schedule": ("auto", "chunks", "segments"),
-    "exponent": ("squares", "direct", "expanded"),
-    "evaluation": ("float32", "float64", "tf32", "bfloat16", "float16"),
-    "accumulation": ("float32", "float64", "bfloat16", "float16"),
+    "evaluation": ("float32", "float64"),
+    "accumulation": ("float32", "float64"),
 }
 """Values of the settings that are names; the first is not always the default."""
 
-SIGNIFICANT_BITS = {"float64": 53, "float32": 24, "tf32": 24, "bfloat16": 8, "float16": 11}
-LEAST_NORMAL = {"bfloat16": 2.0**-126, "float16": 2.0**-14}
+SIGNIFICANT_BITS = {"float64": 53, "float32": 24}
 OF_BACKBONES = ("zoomed", "training_focal")
 """Fields that are no options of the rasterizer: backbones set them."""
 PIXEL_VARIANCE = 0.1
@@ -36,8 +34,6 @@ BOX_VARIANCE = 1 / 12
 """Of a pixel as a square, px^2: pixel=window takes it from a dilation, because the integral over the pixel adds it."""
 LEAST_VARIANCE = 1e-6
 """Dilation of splats that are to have none, px^2: everything stays positive."""
-LARGEST_HALF = 65504.0
-"""Of float16."""
 LARGEST_BATCH = 1 << 27
 """Alpha values of the compiled path at once: with their rows and channels they are still counted in 32 bits."""
 
@@ -93,23 +89,18 @@ class RasterSettings:
     more)."""
     path: str = "eager"
     """`eager`: plain torch operations, works everywhere. `compiled`: the same mathematics through torch.compile.
-    Blending more than 8 channels, sums in 16 bits and largest weights take the eager way regardless.
+    Blending more than 8 channels and largest weights take the eager way regardless.
     `auto`: a training run decides (`auto_steps`), and its evaluations follow it; everything else is eager."""
     auto_steps: Steps = 300
     """path=auto compiles for runs of at least this many steps, where a compiler works."""
     schedule: str = "auto"
     """Of the compiled path. `chunks`: front to back, saturated tiles leave. `segments`: all chunks of all tiles at
     once, joined by an associative scan. `auto`: chunks on a CPU, segments on a GPU."""
-    exponent: str = "squares"
-    """How ln alpha is evaluated: `squares` (two affine squares), `direct` (from the offset to the mean),
-    `expanded` (a quadratic polynomial in tile coordinates)."""
     evaluation: str = "float32"
-    """Format in which ln alpha and alpha are evaluated: float64, float32, tf32, bfloat16 or float16. Geometry keeps the
-    splats' dtype. float32 is at least the splats' own: float64 splats are evaluated in float64. tf32 is float32 whose
-    matrix products, those of light included, may round their factors to 10 bits on a GPU; on a CPU it is float32."""
+    """Format of ln alpha and alpha: float32 or float64. Geometry keeps the splats' dtype; float64 splats are evaluated
+    in float64."""
     accumulation: str = "float32"
-    """Format of transmittance, weights and sums of light: float64, float32 (at least the splats' own), bfloat16 or
-    float16. Sums over pixels that make a splat's gradient are never narrower than the splats."""
+    """Format of transmittance, weights and sums of light: float32 (at least the splats' dtype) or float64."""
     tile_cap: Count = 0
     """At most this many splats are blended per tile, the nearest; 0: all."""
 
@@ -147,11 +138,6 @@ class RasterSettings:
     def _check_windows(self) -> None:
         if not self.compensate and self.dilation <= BOX_VARIANCE:
             raise ValueError(f"rasterizer.pixel=window needs a dilation above 1/12 px^2, not {self.dilation}")
-        for role in ("evaluation", "accumulation"):
-            if getattr(self, role) not in ("float32", "float64"):
-                raise ValueError(
-                    f"rasterizer.pixel=window works in float32 or float64, not {role}={getattr(self, role)}"
-                )
 
     def _check_sizes(self) -> None:
         if self.tile_size < 1:
@@ -169,27 +155,11 @@ class RasterSettings:
             raise ValueError(f"rasterizer.tile_cap is {self.tile_cap}; give a number of splats, or 0 for no cap")
 
     def _check_formats(self) -> None:
-        """What the chosen formats cannot express would be silently wrong, or divide by 1 - alpha = 0."""
+        """Refuses an alpha_max that rounds to 1: gradients divide by 1 - alpha."""
         for role in ("evaluation", "accumulation"):
             name = getattr(self, role)
             if 1 - self.alpha_max < 2.0 ** -SIGNIFICANT_BITS[name]:
                 raise ValueError(f"rasterizer.alpha_max={self.alpha_max} is 1 in {role}={name}; lower it")
-        if self.alpha_min < LEAST_NORMAL.get(self.evaluation, 0.0):
-            raise ValueError(
-                f"rasterizer.alpha_min={self.alpha_min} is below the {LEAST_NORMAL[self.evaluation]:.1e} that "
-                f"evaluation={self.evaluation} resolves; raise it or choose bfloat16 or float32"
-            )
-        unseen = 2.0 ** -(1 + SIGNIFICANT_BITS[self.accumulation])
-        if self.accumulation in LEAST_NORMAL and self.alpha_min < unseen:
-            raise ValueError(
-                f"rasterizer.alpha_min={self.alpha_min}: an alpha below {unseen:.1e} takes nothing from a T of 1 "
-                f"in accumulation={self.accumulation}; raise it or accumulate in float32"
-            )
-        if self.evaluation == "float16" and self.largest_exponent > LARGEST_HALF:
-            raise ValueError(
-                f"rasterizer.evaluation=float16 cannot hold ln alpha = {-self.largest_exponent:.3g}, which "
-                f"tile_size={self.tile_size} and dilation={self.dilation} px^2 allow; choose bfloat16 or smaller tiles"
-            )
 
     def dilation_at(self, focal: float) -> tuple[float, float]:
         """(dilation, the dilation that opacities are compensated from or 0), px^2, for a focal length in px."""
@@ -208,9 +178,3 @@ class RasterSettings:
     def published_dilation(self) -> bool:
         """Whether all cameras dilate by `dilation`, compensated or not."""
         return self.zoomed == "plain" and self.pixel == "sample"
-
-    @property
-    def largest_exponent(self) -> float:
-        """Bound of s^2 + r^2 in a tile that a splat reaches: dilation alone is the narrowest splat, a diagonal away."""
-        least = PIXEL_VARIANCE if self.zoomed == "resampled" else self.dilation
-        return (self.tile_size / math.sqrt(least) + math.sqrt(-math.log(self.alpha_min))) ** 2

@@ -23,6 +23,7 @@ RENAMED = {
 REMOVED: dict[str, Any] = {
     "trunk_gb": None,
     "training.cuda_graphs": None,
+    "rasterizer.exponent": "squares",
 }
 """Keys without a successor, each with the value by which gsx still trains; None: the key changed no result."""
 
