@@ -55,11 +55,7 @@ class PseudoDetails(Redrawing):
         self.views: dict[int, list[PseudoView]] = {}
 
     def refuse_impossible(self) -> None:
-        """Now, not when half of the run is over.
-
-        Raises:
-            ConfigError, InputError: windows would be too small, or the regenerator cannot do what it will be asked for.
-        """
+        """Now, not when half of the run is over."""
         options, name = self.options, self.context.name
         for view in self.context.scene.train:
             if options.coarser and min(view.camera.size) < LEAST_WINDOW * max(options.coarser):
@@ -164,11 +160,7 @@ class PseudoDetails(Redrawing):
         return views
 
     def made(self, run: Run, event: int, parents: Set[int]) -> tuple[list[PseudoView], dict[str, Any]]:
-        """(pseudo views of some training views, facts) of an event, from the model as it is now.
-
-        Raises:
-            TrainingError: more than half of the pictures of a scale could not be used.
-        """
+        """(pseudo views of some training views, facts) of an event, from the model as it is now."""
         learnt = self.regenerator.prepare(run, self.context)
         if learnt:
             told = ", ".join(f"{name} {value:.3g}" for name, value in learnt.items())

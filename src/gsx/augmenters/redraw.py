@@ -171,7 +171,7 @@ class Redrawer:
         return None if bool((pixel_weight == 1).all()) else in_bytes(pixel_weight)
 
     def show(self, folder: Path, spec: PseudoViewSpec, request: Request, view: PseudoView) -> None:
-        """Keep a picture to be looked at: what was redrawn, enlarged, the result, and their difference."""
+        """Keeps a picture to be looked at: what was redrawn, enlarged, the result, and their difference."""
         given = as_blocks(spec.inside.cut(request.image), spec.scale)
         result = view.target.float() / 255
         difference = (0.5 + 4 * (result - given)).clamp(0, 1)

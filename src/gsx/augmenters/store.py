@@ -32,7 +32,7 @@ class Store:
     span: int
 
     def write(self, run: Run, event: int, views: Sequence[PseudoView], facts: dict[str, Any]) -> None:
-        """Keep the pseudo views of an event in place of those that no checkpoint needs any more."""
+        """Keeps the pseudo views of an event in place of those that no checkpoint needs any more."""
         path = self.path(run, event)
         path.parent.mkdir(parents=True, exist_ok=True)
         save_views(path, views, facts)
@@ -47,7 +47,7 @@ class Store:
         return sorted((run.folder / "pseudo").glob(f"{self.name}_{'[0-9]' * 7}.safetensors"))
 
     def forget(self, run: Run, event: int) -> None:
-        """Remove the files of events in whose windows no checkpoint lies, but for that of the current one."""
+        """Removes the files of events in whose windows no checkpoint lies, but for that of the current one."""
         steps = map(step_of, sidecars(run.folder / "checkpoints"))
         needed = {event} | {event_at(step + 1, self.events, self.span) for step in steps}
         kept = {self.path(run, number) for number in needed if number is not None}
@@ -59,9 +59,6 @@ class Store:
         """The pseudo views that the run had made before it was interrupted.
 
         None where it was made longer since, so that its events and windows lie elsewhere: the next one goes on.
-
-        Raises:
-            InputError: the file is gone or damaged.
         """
         path = self.path(run, event)
         latest = [path] if path.is_file() else self.files(run)[-1:]
@@ -84,7 +81,7 @@ def picture_name(augmenter: str, view: PseudoView) -> str:
 
 
 def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -> None:
-    """Write pseudo views and `facts` as one safetensors file, whole or not at all."""
+    """Writes pseudo views and `facts` as one safetensors file, whole or not at all."""
     from safetensors.torch import save
 
     tensors: dict[str, Tensor] = {}
@@ -106,11 +103,7 @@ def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -
 
 
 def load_views(path: Path) -> tuple[list[PseudoView], dict[str, Any]]:
-    """(views, facts) as `save_views` wrote them.
-
-    Raises:
-        OSError, ValueError: the file cannot be read.
-    """
+    """(views, facts) as `save_views` wrote them."""
     from safetensors import SafetensorError, safe_open
 
     try:

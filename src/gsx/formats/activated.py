@@ -15,7 +15,7 @@ MOST = 0.9
 
 
 def activated_words(gaussians: Gaussians) -> Iterator[str]:
-    """Yield a sentence if raw values look like activated ones: all scales positive, all opacities in [0, 1].
+    """Yields a sentence if raw values look like activated ones: all scales positive, all opacities in [0, 1].
 
     Both are one sign: large scenes have splats beyond one unit, and opacities between 0.5 and 0.73 may be all that a
     small file has. Of many splats one of them suffices if it is unmistakable.
@@ -40,5 +40,5 @@ def activated_words(gaussians: Gaussians) -> Iterator[str]:
 
 
 def quantile(values: torch.Tensor, share: float) -> torch.Tensor:
-    """Return the value below which a share of the values lies."""
+    """Returns the value below which a share of the values lies."""
     return values.flatten().kthvalue(max(1, int(share * values.numel()))).values

@@ -1,7 +1,9 @@
 """Gaussians as arrays of numpy in the units that compact files hold, and what their formats share."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -11,6 +13,11 @@ from gsx.core.gaussians.sh import degree_of
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float, Int
 
+logger = logging.getLogger(__name__)
+
+V = TypeVar("V", np.ndarray, torch.Tensor)
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""Components of a quaternion other than the first, second, third, fourth."""
 SMALLEST_OPACITY = 1e-6
 """Opacities read as 0 or 1 are this far from it: their logits are finite."""
 
@@ -30,12 +37,12 @@ class Arrays:
 
     @property
     def degree(self) -> int:
-        """Of the spherical harmonics."""
+        """Returns the degree of the spherical harmonics."""
         return degree_of(self.sh_rest.shape[1])
 
 
 def arrays_of(gaussians: Gaussians) -> Arrays:
-    """Return the arrays of Gaussians; a zero quaternion becomes the identity.
+    """Returns the arrays of Gaussians; a zero quaternion becomes the identity.
 
     Raises:
         InputError: a value is not finite; the message has its name and the number of rows.
@@ -56,22 +63,32 @@ def arrays_of(gaussians: Gaussians) -> Arrays:
 
 
 def unit_quaternions(quats: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
-    """Return quaternions (w, x, y, z) of length 1; one of length 0 becomes the identity."""
+    """Returns quaternions (w, x, y, z) of length 1; one of length 0 becomes the identity."""
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):  # infinite ones become nan
         return np.where(norms == 0, [1.0, 0.0, 0.0, 0.0], quats / np.where(norms == 0, 1, norms))
 
 
 def gaussians_from(arrays: Arrays) -> Gaussians:
-    """Gaussians of arrays, float32."""
+    """Returns Gaussians of arrays, float32."""
     inner = arrays.opacities.clip(SMALLEST_OPACITY, 1 - SMALLEST_OPACITY)
     raw = vars(arrays) | {"opacity_logits": np.log(inner / (1 - inner))}
     raw.pop("opacities")
     return Gaussians(**{name: torch.from_numpy(value.astype(np.float32)) for name, value in raw.items()})
 
 
+def finite_rows(values: Mapping[str, V], name: str) -> dict[str, V]:
+    """Returns the rows that are finite in all values; logs how many others a file of that name has."""
+    finite = np.all([np.isfinite(np.asarray(part)).reshape(len(part), -1).all(1) for part in values.values()], 0)
+    if finite.all():
+        return dict(values)
+    logger.warning("%s: %d of %d splats have values that are not finite, and are left out", name, (~finite).sum(),
+                   len(finite))  # fmt: skip
+    return {key: part[finite] for key, part in values.items()}
+
+
 def joined(parts: Sequence[Arrays]) -> Arrays:
-    """Return the splats of several parts, with the bands of the highest degree among them; those that some lack are 0.
+    """Returns the splats of several parts, with the bands of the highest degree among them; those that some lack are 0.
 
     One part is returned as it is.
     """
@@ -84,23 +101,21 @@ def joined(parts: Sequence[Arrays]) -> Arrays:
 
 
 def rounded(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """The nearest whole numbers, halves away from zero."""
+    """Rounds to whole numbers, halves away from zero."""
     return np.copysign(np.floor(np.abs(values) + 0.5), values)
 
 
 def smallest_three(quats: Float[np.ndarray, "N 4"]) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
-    """(index of the largest component, the others in their order, signed so that the largest is positive)."""
+    """Returns (index of the largest component, the others, signed so that the largest is positive)."""
     largest = np.abs(quats).argmax(1)
     rows = np.arange(len(quats))
     signs = np.where(quats[rows, largest] < 0, -1.0, 1.0)
-    others = np.stack([np.delete(np.arange(4), index) for index in range(4)])[largest]
-    return largest, quats[rows[:, None], others] * signs[:, None]
+    return largest, quats[rows[:, None], OTHERS[largest]] * signs[:, None]
 
 
 def from_smallest_three(largest: Int[np.ndarray, "N"], three: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4"]:
-    """Unit quaternions of `smallest_three`."""
-    others = np.stack([np.delete(np.arange(4), index) for index in range(4)])[largest]
+    """Returns the unit quaternions that `smallest_three` took apart."""
     quats, rows = np.empty((len(three), 4)), np.arange(len(three))
-    quats[rows[:, None], others] = three
+    quats[rows[:, None], OTHERS[largest]] = three
     quats[rows, largest] = np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)

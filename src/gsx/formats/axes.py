@@ -18,7 +18,7 @@ QUARTER = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dty
 
 
 def to_training_axes(gaussians: Gaussians, axes: str) -> Gaussians:
-    """Return the same Gaussians in RDF; `axes`: one of SYSTEMS, which they are in now.
+    """Returns the same Gaussians in RDF; `axes`: one of SYSTEMS, which they are in now.
 
     Left-handed systems are mirrored, which ellipsoids and spherical harmonics follow exactly. Systems whose y is front
     or back are those that stand 8 places before them, turned: of LFD, RFD, LBU and RBU that is what the library does,
@@ -32,12 +32,12 @@ def to_training_axes(gaussians: Gaussians, axes: str) -> Gaussians:
 
 
 def signs_between(axes: str, others: str) -> Float[Tensor, "3"]:
-    """Return the signs of x, y and z that take one system to another."""
+    """Returns the signs of x, y and z that take one system to another."""
     return torch.tensor([1.0 if a == b else -1.0 for a, b in zip(axes, others, strict=True)])
 
 
 def flipped(gaussians: Gaussians, signs: Float[Tensor, "3"]) -> Gaussians:
-    """Return the same Gaussians where x, y and z are multiplied by signs of 1 or -1."""
+    """Returns the same Gaussians where x, y and z are multiplied by signs of 1 or -1."""
     x, y, z = signs.tolist()
     turn = [1, y * z, x * z, x * y]
     bands = [y, z, x, x * y, y * z, 1, x * z, 1, y, x * y * z, y, z, x, z, x]

@@ -12,7 +12,7 @@ CHUNK_VALUES = 1 << 24
 
 
 def number_book(values: Float[np.ndarray, "V"], size: int) -> Float[np.ndarray, "size"]:
-    """Ascending numbers that lie near all values: k-means in one dimension.
+    """Finds ascending numbers that lie near all values: k-means in one dimension.
 
     It begins with quantiles, where values are many, and with even steps to the ends, where they are few.
     """
@@ -28,14 +28,14 @@ def number_book(values: Float[np.ndarray, "V"], size: int) -> Float[np.ndarray, 
 
 
 def nearest_number(values: Float[np.ndarray, "..."], book: Float[np.ndarray, "size"]) -> Int[np.ndarray, "..."]:
-    """Index of the nearest number of an ascending book."""
+    """Returns the index of the nearest number of an ascending book."""
     return np.searchsorted((book[1:] + book[:-1]) / 2, values)
 
 
 def vector_book(
     vectors: Float[np.ndarray, "N D"], size: int
 ) -> tuple[Float[np.ndarray, "size D"], Int[np.ndarray, "N"]]:
-    """(vectors that lie near all, the nearest of them for each): k-means from evenly spaced rows."""
+    """Finds (vectors that lie near all, the nearest of them for each): k-means from evenly spaced rows."""
     points = torch.from_numpy(vectors.astype(np.float32))
     book = points[torch.arange(size) * len(points) // size].clone()
     labels = nearest_vector(points, book)
@@ -48,7 +48,7 @@ def vector_book(
 
 
 def nearest_vector(points: Float[torch.Tensor, "N D"], book: Float[torch.Tensor, "K D"]) -> Int[torch.Tensor, "N"]:
-    """Row of the nearest vector of a book."""
+    """Returns the row of the nearest vector of a book."""
     squares = book.square().sum(1)
     rows = max(1, CHUNK_VALUES // len(book))
     return torch.cat([(squares - 2 * part @ book.T).argmin(1) for part in points.split(rows)])

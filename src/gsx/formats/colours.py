@@ -16,7 +16,7 @@ OVERSHOOT = 0.5
 
 
 def colours_among(columns: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """Return the three colour columns [N, 3], in the type and unit stored; None: there are none."""
+    """Returns the three colour columns [N, 3], in the type and unit stored; None: there are none."""
     for names in COLOUR_NAMES:
         if set(names) <= columns.keys():
             return np.stack([columns[name] for name in names], axis=1)
@@ -24,7 +24,7 @@ def colours_among(columns: Mapping[str, np.ndarray]) -> np.ndarray | None:
 
 
 def full_scale_of(values: np.ndarray) -> float | None:
-    """Return the value that stands for full intensity, by type and range; None: nobody writes such colours.
+    """Returns the value that stands for full intensity, by type and range; None: nobody writes such colours.
 
     Bytes have 255. Whole numbers of other types have 255 up to there, 65,535 beyond it. Floats have 1 within
     OVERSHOOT of [0, 1], 255 within [0, 255].

@@ -30,7 +30,7 @@ MOST_REST = 45
 
 
 def encode_compressed_ply(arrays: Arrays, comments: Sequence[str] = ()) -> bytes:
-    """A file.
+    """Encodes a file.
 
     Raises:
         InputError: there are no splats.
@@ -72,7 +72,7 @@ def encode_compressed_ply(arrays: Arrays, comments: Sequence[str] = ()) -> bytes
 
 
 def chunk_order(means: Float[np.ndarray, "N 3"], opacities: Float[np.ndarray, "N"]) -> Int[np.ndarray, "N"]:
-    """Rows along a Morton curve; those FAR beyond most others, as a sky, come last, along one of their own.
+    """Orders rows along a Morton curve; those FAR beyond most others, as a sky, come last, along one of their own.
 
     On one curve a few of them would leave all others in a single cell, and chunks as large as the whole. The chunk in
     which both meet is filled with the faintest of the others, whose places become coarse.
@@ -89,7 +89,7 @@ def chunk_order(means: Float[np.ndarray, "N 3"], opacities: Float[np.ndarray, "N
 
 
 def morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
-    """Rows along a Morton curve of 10 bits an axis; equal ones in their order."""
+    """Orders rows along a Morton curve of 10 bits an axis; equal ones in their order."""
     least, most = means.min(0), means.max(0)
     cells = bits(share(means, least, most), 10)
     spread = np.sum([(cells >> bit & 1) << 3 * bit for bit in range(10)], 0)
@@ -100,25 +100,25 @@ def morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
 def share(
     values: Float[np.ndarray, "N 3"], least: Float[np.ndarray, "..."], most: Float[np.ndarray, "..."]
 ) -> Float[np.ndarray, "N 3"]:
-    """Where values lie between the least and the most of their chunk, in [0, 1]; 0 where these are one."""
+    """Returns where values lie between the least and the most of their chunk, in [0, 1]; 0 where these are one."""
     span = most.astype(float) - least
     return np.where(span < LEAST_RANGE, 0, (values - least) / np.maximum(span, LEAST_RANGE)).clip(0, 1)
 
 
 def bits(shares: Float[np.ndarray, "..."], count: int) -> Int[np.ndarray, "..."]:
-    """Shares in [0, 1] as whole numbers of so many bits."""
+    """Converts shares in [0, 1] to whole numbers of so many bits."""
     most = 2**count - 1
     return np.floor(shares * most + 0.5).clip(0, most).astype(np.int64)
 
 
 def packed_11_10_11(shares: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
-    """Three shares in 32 bits."""
+    """Packs three shares into 32 bits."""
     x, y, z = (bits(shares[:, axis], count) for axis, count in enumerate((11, 10, 11)))
     return x << 21 | y << 11 | z
 
 
 def decode_compressed_ply(content: bytes) -> Arrays:
-    """Splats of a file.
+    """Decodes a file.
 
     Raises:
         InputError: it is damaged, or no compressed PLY.
@@ -151,7 +151,7 @@ def decode_compressed_ply(content: bytes) -> Arrays:
 
 
 def ends(chunks: np.ndarray, first: int) -> tuple[Float[np.ndarray, "C 3"], Float[np.ndarray, "C 3"]]:
-    """The least and the most that chunks have, of the properties from one of BOUNDS on."""
+    """Returns the least and the most values of chunks, of the properties from one of BOUNDS on."""
     columns = np.stack([chunks[name].astype(float) for name in BOUNDS[first : first + 6]], 1)
     return columns[:, :3], columns[:, 3:]
 
@@ -162,27 +162,18 @@ def unpacked_11_10_11(
     most: Float[np.ndarray, "C 3"],
     chunk_of: Int[np.ndarray, "N"],
 ) -> Float[np.ndarray, "N 3"]:
-    """What `packed_11_10_11` stands for in each chunk."""
+    """Unpacks `packed_11_10_11` into the range of each chunk."""
     shares = np.stack([packed >> 21, packed >> 11 & 1023, packed & 2047], 1) / (2047, 1023, 2047)
     return least[chunk_of] + (most - least)[chunk_of] * shares
 
 
 def higher_bands(table: np.ndarray | None, count: int) -> Float[np.ndarray, "N B 3"]:
-    """Coefficients beside the constant one; none where there is no table.
-
-    Raises:
-        InputError: they are not those of whole bands, or not of all splats.
-    """
-    names = [] if table is None else list(table.dtype.names or ())
-    if table is not None and (
-        len(names) not in (9, 24, MOST_REST)
-        or len(table) != count
-        or set(names) != {f"f_rest_{i}" for i in range(len(names))}
-    ):
+    """Returns coefficients of higher bands; none where there is no table."""
+    if table is None:
+        return np.zeros((count, 0, 3))
+    names = [f"f_rest_{i}" for i in range(len(table.dtype.names or ()))]
+    if len(names) not in (9, 24, MOST_REST) or len(table) != count or set(names) != set(table.dtype.names or ()):
         raise InputError("its spherical harmonics are not those of its splats: export it anew")
-    stored = (
-        np.stack([table[f"f_rest_{i}"] for i in range(len(names))], 1) if table is not None else np.empty((count, 0))
-    )
-    values = ((stored + 0.5) / 256 - 0.5) * 8
-    values = np.where(stored == 0, -4.0, np.where(stored == 255, 4.0, values))
+    stored = np.stack([table[name] for name in names], 1)
+    values = np.select([stored == 0, stored == 255], [-4.0, 4.0], ((stored + 0.5) / 256 - 0.5) * 8)
     return values.reshape(count, 3, -1).transpose(0, 2, 1)

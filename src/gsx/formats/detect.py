@@ -14,7 +14,7 @@ PACKED_PROPERTY = b" packed_position"
 
 
 def format_of(head: bytes, path: Path) -> str:
-    """Return which of SUFFIXES a file is, by its first bytes, or by its name where these show none."""
+    """Returns which of SUFFIXES a file is, by its first bytes, or by its name where these show none."""
     if head.startswith(b"ply"):
         return ".compressed.ply" if PACKED_PROPERTY in head[: header_length(head)] else STANDARD
     named = suffix_of(path) or STANDARD

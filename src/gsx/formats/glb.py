@@ -18,7 +18,7 @@ import numpy as np
 from gsx.core.errors import InputError
 from gsx.core.gaussians.sh import degree_of
 from gsx.core.shapes import Float
-from gsx.formats.arrays import Arrays, joined
+from gsx.formats.arrays import Arrays, finite_rows, joined
 from gsx.formats.gltf_asset import (
     BINARY_CHUNK,
     FLOAT,
@@ -68,7 +68,7 @@ OVERSHOOT = 1e-3
 
 
 def encode_glb(arrays: Arrays, comments: Sequence[str] = (), origin: Sequence[float] = (0.0, 0.0, 0.0)) -> bytes:
-    """A file. origin: added to positions, by the node.
+    """Encodes a file. origin: added to positions, by the node.
 
     Raises:
         InputError: there are no splats.
@@ -106,13 +106,13 @@ def encode_glb(arrays: Arrays, comments: Sequence[str] = (), origin: Sequence[fl
 
 
 def translation_by(origin: Sequence[float]) -> dict[str, list[float]]:
-    """Return what a node has that moves splats by an origin, in glTF's world; nothing without an origin."""
+    """Returns what a node has that moves splats by an origin, in glTF's world; nothing without an origin."""
     x, y, z = origin
     return {"translation": [-x, -y, z]} if any(origin) else {}
 
 
 def attributes_of(arrays: Arrays) -> dict[str, Float[np.ndarray, "..."]]:
-    """Attributes by name, in the units of the extension."""
+    """Returns attributes by name, in the units of the extension."""
     found = {
         POSITION: arrays.means,
         ROTATION: arrays.quats[:, [1, 2, 3, 0]],
@@ -124,12 +124,12 @@ def attributes_of(arrays: Arrays) -> dict[str, Float[np.ndarray, "..."]]:
 
 
 def higher_bands(degree: int) -> list[str]:
-    """Attributes of all bands but the constant one."""
+    """Returns the names of the attributes of all bands but the constant one."""
     return [f"{EXTENSION}:SH_DEGREE_{band}_COEF_{n}" for band in range(1, degree + 1) for n in range(2 * band + 1)]
 
 
 def chunk(kind: int, content: bytes, padding: bytes) -> bytes:
-    """A chunk of the container, of a multiple of 4 bytes."""
+    """Packs a chunk of the container, of a multiple of 4 bytes."""
     content += padding * (-len(content) % 4)
     return struct.pack("<II", len(content), kind) + content
 
@@ -138,7 +138,7 @@ def chunk(kind: int, content: bytes, padding: bytes) -> bytes:
 
 
 def decode_glb(content: bytes, name: str = "", folder: Path | None = None) -> Arrays:
-    """Return the splats of a GLB or glTF of any program, in the axes of training worlds.
+    """Returns the splats of a GLB or glTF of any program, in the axes of training worlds.
 
     All splats of its scene are put together, each where its node is. Other primitives are left out, as are rows that
     are not finite. name: of the file, for the log; folder: of its buffers.
@@ -167,23 +167,19 @@ def decode_glb(content: bytes, name: str = "", folder: Path | None = None) -> Ar
 
 
 def names_linear(content: bytes) -> bool:
-    """Return whether a GLB or glTF names colours of linear light."""
+    """Returns whether a GLB or glTF names colours of linear light."""
     return f'"{LINEAR}"'.encode() in content
 
 
 def holds_splats(primitive: Any) -> bool:
-    """Return whether a primitive is of splats."""
+    """Returns whether a primitive is of splats."""
     if not isinstance(primitive, dict):
         raise InputError("one of its primitives is no object: export it anew")
     return EXTENSION in part_of(primitive, "extensions") or bool(compression_of(primitive))
 
 
 def splats_of_primitive(asset: Asset, primitive: Entry, name: str) -> Arrays:
-    """Return the splats of a primitive in its own axes, their colours in sRGB.
-
-    Raises:
-        InputError: they are damaged, or drawn otherwise than by this extension.
-    """
+    """Returns the splats of a primitive in its own axes, their colours in sRGB."""
     options = part_of(part_of(primitive, "extensions"), EXTENSION)
     refuse_other_rules(options)
     compressed = compression_of(primitive)
@@ -193,6 +189,7 @@ def splats_of_primitive(asset: Asset, primitive: Entry, name: str) -> Arrays:
     else:
         attributes = part_of(primitive, "attributes")
         found = {key: values_of(asset, attributes[key]) for key in wanted(attributes)}
+        refuse_shapes(found)
         arrays = arrays_of_attributes(finite_rows(found, name))
     for key, usual in {"kernel": RULES["kernel"], "colorSpace": SRGB}.items():
         if key not in options:
@@ -204,7 +201,7 @@ def splats_of_primitive(asset: Asset, primitive: Entry, name: str) -> Arrays:
 
 
 def compression_of(primitive: Entry) -> Entry:
-    """Return the extension that keeps a primitive's splats as SPZ; empty: there is none."""
+    """Returns the extension that keeps a primitive's splats as SPZ; empty: there is none."""
     extensions = part_of(primitive, "extensions")
     inner = part_of(part_of(extensions, EXTENSION), "extensions")
     names = [key for key in extensions | inner if key in SPZ_EXTENSIONS]
@@ -212,7 +209,7 @@ def compression_of(primitive: Entry) -> Entry:
 
 
 def refuse_other_rules(options: Entry) -> None:
-    """Raise InputError if splats are drawn otherwise than as ellipses in perspective."""
+    """Raises InputError if splats are drawn otherwise than as ellipses in perspective."""
     for key, known in RULES.items():
         value = options.get(key, known)
         if value != known:
@@ -223,11 +220,7 @@ def refuse_other_rules(options: Entry) -> None:
 
 
 def wanted(attributes: Entry) -> list[str]:
-    """Return the attributes that splats are read from; others, such as COLOR_0, repeat them.
-
-    Raises:
-        InputError: one is missing, or bands are not whole.
-    """
+    """Returns the attributes that splats are read from; others, such as COLOR_0, repeat them."""
     missing = [name for name in REQUIRED if name not in attributes]
     if missing:
         draft = ", as drafts of the extension did" if "_ROTATION" in attributes or "_SCALE" in attributes else ""
@@ -239,31 +232,17 @@ def wanted(attributes: Entry) -> list[str]:
     return [*REQUIRED, *bands]
 
 
-def finite_rows(found: dict[str, Float[np.ndarray, "N k"]], name: str) -> dict[str, Float[np.ndarray, "M k"]]:
-    """Return attributes of the splats that are finite in all; log how many others there were.
-
-    Raises:
-        InputError: attributes have a form that those of splats do not have.
-    """
+def refuse_shapes(found: dict[str, Float[np.ndarray, "N k"]]) -> None:
+    """Raises InputError if attributes have a form that those of splats do not have."""
     for key, values in found.items():
         width = {ROTATION: 4, OPACITY: 1}.get(key, 3)
         if values.shape != (len(found[POSITION]), width):
             raise InputError(f"its attribute {key} has {values.shape[0]:,} x {values.shape[1]} values, "
                              f"not {len(found[POSITION]):,} x {width}: export it anew")  # fmt: skip
-    finite = np.all([np.isfinite(values).all(1) for values in found.values()], 0)
-    if finite.all():
-        return found
-    logger.warning("%s: %d of %d splats have values that are not finite, and are left out", name, (~finite).sum(),
-                   len(finite))  # fmt: skip
-    return {key: values[finite] for key, values in found.items()}
 
 
 def arrays_of_attributes(found: dict[str, Float[np.ndarray, "N k"]]) -> Arrays:
-    """Return splats of finite attributes by name.
-
-    Raises:
-        InputError: a scale or an opacity is none.
-    """
+    """Returns splats of finite attributes by name."""
     scales, opacities, quats = found[SCALE], found[OPACITY][:, 0], found[ROTATION]
     if (scales < 0).any():
         raise InputError("a scale is below 0, but scales are no logarithms in glTF: export it anew")
@@ -283,6 +262,6 @@ def arrays_of_attributes(found: dict[str, Float[np.ndarray, "N k"]]) -> Arrays:
 
 
 def refuse_far(arrays: Arrays) -> None:
-    """Raise InputError if a node moved splats beyond what 32 bits hold."""
+    """Raises InputError if a node moved splats beyond what 32 bits hold."""
     if len(arrays.means) and not np.abs(arrays.means).max() <= np.finfo(np.float32).max:
         raise InputError("its splats lie beyond what 32 bits hold: export them with their transform applied")

@@ -1,4 +1,7 @@
-"""Documents, buffers and accessors of glTF 2.0, as GLB or as text with its buffers (glTF specification, 3.6 and 4)."""
+"""Documents, buffers and accessors of glTF 2.0, as GLB or as text with its buffers (glTF specification, 3.6 and 4).
+
+Damaged content raises InputError, which calls the file "it".
+"""
 
 import base64
 import binascii
@@ -45,7 +48,7 @@ class Asset:
 
 
 def asset_of(content: bytes, folder: Path | None = None) -> Asset:
-    """Return the asset of a GLB, or of a glTF as text.
+    """Returns the asset of a GLB, or of a glTF as text.
 
     Raises:
         InputError: it is neither, ends early, or is of another version.
@@ -57,11 +60,7 @@ def asset_of(content: bytes, folder: Path | None = None) -> Asset:
 
 
 def chunks_of(content: bytes) -> tuple[bytes, bytes]:
-    """Return the text and the binary chunk of a GLB; chunks of other kinds are skipped.
-
-    Raises:
-        InputError: it is no GLB of version 2, or ends early.
-    """
+    """Returns the text and the binary chunk of a GLB; chunks of other kinds are skipped."""
     if len(content) < 12 or struct.unpack_from("<I", content)[0] != MAGIC:
         raise InputError("it is no GLB: export it anew")
     _, version, length = struct.unpack_from("<III", content)
@@ -83,11 +82,7 @@ def chunks_of(content: bytes) -> tuple[bytes, bytes]:
 
 
 def document_of(text: bytes) -> Entry:
-    """Return the document of a text.
-
-    Raises:
-        InputError: it is no JSON, or of another version.
-    """
+    """Returns the document of a text."""
     try:
         document = json.loads(text.decode("utf-8-sig"))
     except (ValueError, RecursionError):
@@ -101,11 +96,7 @@ def document_of(text: bytes) -> Entry:
 
 
 def entry_at(document: Entry, collection: str, index: Any) -> Entry:
-    """Return an entry of a collection of the document, such as a node.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Returns an entry of a collection of the document, such as a node."""
     entries = list_in(document, collection)
     if type(index) is int and 0 <= index < len(entries) and isinstance(entries[index], dict):
         return dict(entries[index])
@@ -113,11 +104,7 @@ def entry_at(document: Entry, collection: str, index: Any) -> Entry:
 
 
 def part_of(entry: Entry, key: str) -> Entry:
-    """Return an object within an entry; empty: it has none.
-
-    Raises:
-        InputError: it is something else.
-    """
+    """Returns an object within an entry; empty: it has none."""
     part = entry.get(key, {})
     if not isinstance(part, dict):
         raise InputError(f"its '{key}' is no object: export it anew")
@@ -125,11 +112,7 @@ def part_of(entry: Entry, key: str) -> Entry:
 
 
 def list_in(entry: Entry, key: str) -> list[Any]:
-    """Return a list within an entry; empty: it has none.
-
-    Raises:
-        InputError: it is something else.
-    """
+    """Returns a list within an entry; empty: it has none."""
     values = entry.get(key, [])
     if not isinstance(values, list):
         raise InputError(f"its '{key}' is no list: export it anew")
@@ -137,11 +120,7 @@ def list_in(entry: Entry, key: str) -> list[Any]:
 
 
 def whole_in(entry: Entry, key: str, default: int | None = None) -> int:
-    """Return a whole number >= 0 of an entry.
-
-    Raises:
-        InputError: it has none.
-    """
+    """Returns a whole number >= 0 of an entry."""
     value = entry.get(key, default)
     if type(value) is not int or not 0 <= value < 2**53:
         raise InputError(f"its '{key}' is {str(value)[:20]}, no whole number: export it anew")
@@ -149,11 +128,7 @@ def whole_in(entry: Entry, key: str, default: int | None = None) -> int:
 
 
 def numbers_in(entry: Entry, key: str, default: Sequence[float]) -> Float[np.ndarray, "k"]:
-    """Return as many numbers of an entry as the default has.
-
-    Raises:
-        InputError: it has others, or one that is not finite.
-    """
+    """Returns as many numbers of an entry as the default has."""
     values = entry.get(key, default)
     counted = isinstance(values, Sequence) and len(values) == len(default)
     if counted and all(type(value) in (int, float) and abs(value) < LARGEST for value in values):
@@ -165,11 +140,7 @@ def numbers_in(entry: Entry, key: str, default: Sequence[float]) -> Float[np.nda
 
 
 def buffer_of(asset: Asset, index: int) -> bytes:
-    """Return the bytes of a buffer: of the binary chunk, of the document, or of a file next to it.
-
-    Raises:
-        InputError: they are missing, or too few.
-    """
+    """Returns the bytes of a buffer: of the binary chunk, of the document, or of a file next to it."""
     if index not in asset.buffers:
         entry = entry_at(asset.document, "buffers", index)
         content = asset.binary if "uri" not in entry else linked(asset, entry["uri"])
@@ -181,11 +152,7 @@ def buffer_of(asset: Asset, index: int) -> bytes:
 
 
 def linked(asset: Asset, uri: Any) -> bytes:
-    """Return the bytes that a buffer's URI stands for.
-
-    Raises:
-        InputError: it is damaged, leads out of the folder, or cannot be read.
-    """
+    """Returns the bytes that a buffer's URI stands for."""
     if isinstance(uri, str) and uri.startswith(DATA_URI):
         head, _, data = uri.partition(",")
         try:
@@ -211,11 +178,7 @@ def linked(asset: Asset, uri: Any) -> bytes:
 
 
 def view_of(asset: Asset, index: Any) -> tuple[bytes, Entry]:
-    """Return the bytes of a buffer view, and its entry.
-
-    Raises:
-        InputError: it lies beyond its buffer, or is compressed.
-    """
+    """Returns the bytes of a buffer view, and its entry."""
     entry = entry_at(asset.document, "bufferViews", index)
     compressed = [name for name in COMPRESSED_VIEWS if name in part_of(entry, "extensions")]
     if compressed:
@@ -228,7 +191,7 @@ def view_of(asset: Asset, index: Any) -> tuple[bytes, Entry]:
 
 
 def values_of(asset: Asset, index: Any) -> Float[np.ndarray, "N k"]:
-    """Return the values of an accessor: of any type, normalised where it says so, sparse ones filled in.
+    """Returns the values of an accessor: of any type, normalised where it says so, sparse ones filled in.
 
     Raises:
         InputError: it is damaged, or of a type that splats do not have.
@@ -244,11 +207,7 @@ def values_of(asset: Asset, index: Any) -> Float[np.ndarray, "N k"]:
 
 
 def stored(asset: Asset, accessor: Entry, count: int, width: int) -> np.ndarray:
-    """Return the stored values of an accessor without its sparse ones; zeros where it has no buffer view.
-
-    Raises:
-        InputError: they lie beyond their buffer view.
-    """
+    """Returns the stored values of an accessor without its sparse ones; zeros where it has no buffer view."""
     kind = np.dtype(COMPONENTS[accessor["componentType"]])
     if "bufferView" not in accessor:
         buffers = range(len(list_in(asset.document, "buffers")))
@@ -264,11 +223,7 @@ def stored(asset: Asset, accessor: Entry, count: int, width: int) -> np.ndarray:
 
 
 def fill_sparse(asset: Asset, accessor: Entry, values: np.ndarray) -> None:
-    """Put the sparse values of an accessor in their places.
-
-    Raises:
-        InputError: they are damaged.
-    """
+    """Puts the sparse values of an accessor in their places."""
     sparse = part_of(accessor, "sparse")
     count, indices = whole_in(sparse, "count"), part_of(sparse, "indices")
     if whole_in(indices, "componentType") not in (5121, 5123, 5125) or not count:
@@ -281,7 +236,7 @@ def fill_sparse(asset: Asset, accessor: Entry, values: np.ndarray) -> None:
 
 
 def normalised(values: np.ndarray, accessor: Entry) -> Float[np.ndarray, "N k"]:
-    """Return values as floats: whole numbers as shares of their largest where the accessor is normalised."""
+    """Returns values as floats: whole numbers as shares of their largest where the accessor is normalised."""
     with np.errstate(invalid="ignore"):  # nan of any kind
         floats = values.astype(float)
     if values.dtype.kind == "f" or accessor.get("normalized") is not True:

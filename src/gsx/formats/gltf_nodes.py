@@ -22,7 +22,7 @@ IDENTITY = np.eye(4)
 
 
 def placed_meshes(document: Entry) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
-    """Yield the index of each mesh of the scene and the matrix to the world, once for each node that has it.
+    """Yields the index of each mesh of the scene and the matrix to the world, once for each node that has it.
 
     A document without nodes has its meshes in the world.
 
@@ -47,7 +47,7 @@ def placed_meshes(document: Entry) -> Iterator[tuple[int, Float[np.ndarray, "4 4
 
 
 def roots(document: Entry) -> list[int]:
-    """Return the root nodes of the scene that is displayed; without scenes, nodes that are no children."""
+    """Returns the root nodes of the scene that is displayed; without scenes, nodes that are no children."""
     if list_in(document, "scenes"):
         return list_in(entry_at(document, "scenes", document.get("scene", 0)), "nodes")
     nodes = range(len(list_in(document, "nodes")))
@@ -57,7 +57,7 @@ def roots(document: Entry) -> list[int]:
 
 
 def node_matrix(node: Entry) -> Float[np.ndarray, "4 4"]:
-    """Return the matrix from a node to its parent: as stored, column by column, or translation, rotation, scale."""
+    """Returns the matrix from a node to its parent: as stored, column by column, or translation, rotation, scale."""
     if "matrix" in node:
         return numbers_in(node, "matrix", IDENTITY.flatten().tolist()).reshape(4, 4).T
     x, y, z, w = numbers_in(node, "rotation", (0.0, 0.0, 0.0, 1.0))
@@ -69,7 +69,7 @@ def node_matrix(node: Entry) -> Float[np.ndarray, "4 4"]:
 
 
 def moved(arrays: Arrays, matrix: Float[np.ndarray, "4 4"]) -> Arrays:
-    """Return splats where every point p is `matrix` (p, 1): a rotation after positive scales, and a translation.
+    """Returns splats where every point p is `matrix` (p, 1): a rotation after positive scales, and a translation.
 
     Colours turn with the rotation (KHR_gaussian_splatting, "Splat Lighting").
 
@@ -103,11 +103,7 @@ def moved(arrays: Arrays, matrix: Float[np.ndarray, "4 4"]) -> Arrays:
 
 
 def unscaled(linear: Float[np.ndarray, "3 3"], scale: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation of a node, whose columns are as long as `scale`.
-
-    Raises:
-        InputError: it is none.
-    """
+    """Returns the rotation of a node, whose columns are as long as `scale`."""
     if scale.min() < 1 / LARGEST:
         raise InputError("a node has a scale of 0: export it with its transform applied")
     axes = linear / scale
@@ -120,14 +116,14 @@ def unscaled(linear: Float[np.ndarray, "3 3"], scale: Float[np.ndarray, "3"]) ->
 
 
 def sharpened(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Return a matrix without rounding: whole numbers where it is that close to them."""
+    """Returns a matrix without rounding: whole numbers where it is that close to them."""
     return np.where(np.abs(matrix - matrix.round()) < ROUNDING, matrix.round(), matrix)
 
 
 def stretched(
     arrays: Arrays, linear: Float[np.ndarray, "3 3"]
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 4"]]:
-    """Return logarithms of scales, and quaternions, of splats after a map that is no similarity.
+    """Returns logarithms of scales, and quaternions, of splats after a map that is no similarity.
 
     The covariance becomes M C C^T M^T, whose principal axes are the left singular vectors of M C.
     """

@@ -3,11 +3,12 @@
 A section has the sizes of its partly filled buckets, the centres of all buckets, and its splats. Compression level 0
 holds floats. Levels 1 and 2 hold positions in 16 bits around the centre of a bucket; scales and quaternions, which
 begin with w, as halves. Coefficients of higher bands are halves in level 1, bytes in level 2. Axes are those of
-training worlds.
+training worlds. Damaged content raises InputError, which calls the file "it".
 """
 
 import struct
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class Level:
     coefficient: str
 
     def row(self, coefficients: int) -> np.dtype:
-        """Return the type of a splat's row; coefficients: number without the constant ones, of all colours."""
+        """Returns the type of a splat's row; coefficients: number without the constant ones, of all colours."""
         parts = [("mean", self.mean, 3), ("scale", self.value, 3), ("quat", self.value, 4), ("colour", "u1", 4)]
         return np.dtype([*parts, ("rest", self.coefficient, coefficients)])
 
@@ -67,30 +68,36 @@ class Header:
     """Coefficients that bytes 0 and 255 stand for."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Section:
-    """Header of a section."""
+class Section(NamedTuple):
+    """Header of a section, in the order of SECTION."""
 
-    splats: int
+    loaded: int
+    most: int
     bucket_size: int
     buckets: int
     block: float
     """Side of a bucket's block, scene units."""
     bucket_bytes: int
     half_range: int
+    size: int
     full: int
     """Full buckets, which come first."""
     partial: int
     degree: int
 
     @property
+    def splats(self) -> int:
+        """Returns the number of splats; some writers leave `most` at 0."""
+        return self.most or self.loaded
+
+    @property
     def coefficients(self) -> int:
-        """Number of coefficients without the constant ones, of all colours."""
+        """Returns the number of coefficients without the constant ones, of all colours."""
         return 3 * sum(BANDS[self.degree])
 
 
 def decode_ksplat(content: bytes) -> Arrays:
-    """Return the splats of a file; rows may hold values that are not finite.
+    """Returns the splats of a file; rows may hold values that are not finite.
 
     Raises:
         InputError: it is damaged, of another version, or its counts contradict each other.
@@ -113,11 +120,7 @@ def decode_ksplat(content: bytes) -> Arrays:
 
 
 def header_of(content: bytes) -> Header:
-    """Return the header.
-
-    Raises:
-        InputError: it is none of a version that is read, or says that not all splats are there.
-    """
+    """Returns the header."""
     if len(content) < HEADER_BYTES:
         raise InputError("it is no .ksplat, or ends within its header: copy or export it anew")
     major, minor, sections, _, most, splats, level, *_, least, greatest = HEADER.unpack_from(content)
@@ -137,38 +140,19 @@ def header_of(content: bytes) -> Header:
 
 
 def section_of(content: bytes, number: int, level: int) -> Section:
-    """Return the header of a section.
-
-    Raises:
-        InputError: its degree is none, or its buckets are not those of its splats.
-    """
-    values = SECTION.unpack_from(content, HEADER_BYTES + number * SECTION_BYTES)
-    loaded, most, bucket_size, buckets, block, bucket_bytes, half_range, _, full, partial, degree = values
-    splats = most or loaded
-    section = Section(
-        splats=splats,
-        bucket_size=bucket_size,
-        buckets=buckets,
-        block=block,
-        bucket_bytes=bucket_bytes,
-        half_range=half_range or HALF_RANGE,
-        full=full,
-        partial=partial,
-        degree=degree,
-    )
+    """Returns the header of a section."""
+    section = Section(*SECTION.unpack_from(content, HEADER_BYTES + number * SECTION_BYTES))
+    degree, full = section.degree, section.full
     if degree not in BANDS:
         raise InputError(f"section {number} has degree {degree}; gsx reads 0 to 3: save it anew")
-    if level and (bucket_bytes != CENTRE_BYTES or full + partial != buckets or full * bucket_size > splats):
+    misfit = full + section.partial != section.buckets or full * section.bucket_size > section.splats
+    if level and (section.bucket_bytes != CENTRE_BYTES or misfit):
         raise InputError(f"the buckets of section {number} are not those of its splats: save it anew")
-    return section
+    return section._replace(half_range=section.half_range or HALF_RANGE)
 
 
 def splats_of(content: bytes, start: int, section: Section, header: Header) -> tuple[Arrays, int]:
-    """Return the splats of a section that begins at a byte, and where it ends.
-
-    Raises:
-        InputError: the file ends before it, or its buckets are not those of its splats.
-    """
+    """Returns the splats of a section that begins at a byte, and where it ends."""
     kind = LEVELS[header.level].row(section.coefficients)
     centres = start + 4 * section.partial
     first = centres + section.bucket_bytes * section.buckets
@@ -194,11 +178,7 @@ def splats_of(content: bytes, start: int, section: Section, header: Header) -> t
 
 
 def buckets_of(partial: Int[np.ndarray, "P"], section: Section) -> Int[np.ndarray, "N"]:
-    """Return the bucket of each splat of a section; partial: sizes of the buckets that are not full.
-
-    Raises:
-        InputError: the buckets hold more or fewer splats than the section.
-    """
+    """Returns the bucket of each splat of a section; partial: sizes of the buckets that are not full."""
     held = section.full * section.bucket_size + int(partial.sum())
     if held != section.splats:
         raise InputError(f"its buckets hold {held:,} splats, their section {section.splats:,}: save it anew")
@@ -207,14 +187,14 @@ def buckets_of(partial: Int[np.ndarray, "P"], section: Section) -> Int[np.ndarra
 
 
 def coefficients_of(stored: np.ndarray, header: Header) -> Float[np.ndarray, "N C"]:
-    """Return coefficients of higher bands as numbers."""
+    """Returns coefficients of higher bands as numbers."""
     if stored.dtype != np.uint8:
         return stored.astype(float)
     return header.least + stored / 255 * (header.most - header.least)
 
 
 def higher_bands(values: Float[np.ndarray, "N C"], degree: int) -> Float[np.ndarray, "N B 3"]:
-    """Return coefficients as (coefficient, colour); in a file each band has all of red, then green, then blue."""
+    """Returns coefficients as (coefficient, colour); in a file each band has all of red, then green, then blue."""
     bands, begin = [np.zeros((len(values), 0, 3))], 0
     for size in BANDS[degree]:
         bands.append(values[:, begin : begin + 3 * size].reshape(-1, 3, size).transpose(0, 2, 1))

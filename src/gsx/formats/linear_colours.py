@@ -20,7 +20,7 @@ AT_ONCE = 4096
 
 
 def srgb_of_linear(arrays: Arrays, name: str) -> Arrays:
-    """Return splats of which each shows in sRGB the colour that it has in linear light.
+    """Returns splats of which each shows in sRGB the colour that it has in linear light.
 
     Exact for degree 0. Higher degrees are fitted by least squares over directions spread evenly, and the log has the
     error. Where splats blend, linear light blends otherwise: pictures then differ. name: of the file.
@@ -42,7 +42,7 @@ def srgb_of_linear(arrays: Arrays, name: str) -> Arrays:
 
 
 def basis_of(degree: int) -> Float[np.ndarray, "D B"]:
-    """Return all harmonics up to a degree, the constant one first, in directions spread evenly; one for degree 0."""
+    """Returns all harmonics up to a degree, the constant one first, in directions spread evenly; one for degree 0."""
     if not degree:
         return np.full((1, 1), BAND_0)
     rest = harmonics(spread_directions(DIRECTIONS), degree).numpy()
@@ -50,5 +50,5 @@ def basis_of(degree: int) -> Float[np.ndarray, "D B"]:
 
 
 def encoded(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Return sRGB of linear light >= 0, beyond 1 by the same formula."""
+    """Returns sRGB of linear light >= 0, beyond 1 by the same formula."""
     return display_from_linear(torch.from_numpy(linear), limited=False).numpy()

@@ -23,7 +23,7 @@ STATED = re.compile(rb"gsx origin (\S{1,40}) (\S{1,40}) (\S{1,40})")
 
 
 def chosen_origin(middle: Float[Tensor, "3"], scale: float) -> Origin:
-    """Return a round origin near the middle of a scene of that scale; `NO_ORIGIN` unless the middle is `FAR`."""
+    """Returns a round origin near the middle of a scene of that scale; `NO_ORIGIN` unless the middle is `FAR`."""
     if not FAR * scale < float(middle.abs().max()) < np.inf:
         return NO_ORIGIN
     digits = int(np.floor(np.log10(max(scale, 1e-6))))
@@ -32,7 +32,7 @@ def chosen_origin(middle: Float[Tensor, "3"], scale: float) -> Origin:
 
 
 def origin_of_positions(positions: Float[Tensor, "P 3"]) -> Origin:
-    """Return the origin for splats or points alone: around their median, as far as most are from it."""
+    """Returns the origin for splats or points alone: around their median, as far as most are from it."""
     if not len(positions):
         return NO_ORIGIN
     middle = positions.double().median(0).values
@@ -40,56 +40,56 @@ def origin_of_positions(positions: Float[Tensor, "P 3"]) -> Origin:
 
 
 def in_single_where_resolved(positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-    """Return positions in float32, or as they are where most lie too far from (0, 0, 0) for it."""
+    """Returns positions in float32, or as they are where most lie too far from (0, 0, 0) for it."""
     return positions if any(origin_of_positions(positions)) else positions.float()
 
 
 def around(gaussians: Gaussians, origin: Sequence[float]) -> Gaussians:
-    """Return Gaussians of float64 means relative to an origin, in float32."""
+    """Returns Gaussians of float64 means relative to an origin, in float32."""
     if not any(origin):
         return replace(gaussians, means=gaussians.means.float())
     return replace(gaussians, means=(gaussians.means.double() - float64(origin, gaussians.means)).float())
 
 
 def away(gaussians: Gaussians, origin: Sequence[float]) -> Gaussians:
-    """Return Gaussians whose means, float64, are those of the file again; without an origin the same object."""
+    """Returns Gaussians whose means, float64, are those of the file again; without an origin the same object."""
     if not any(origin):
         return gaussians
     return replace(gaussians, means=gaussians.means.double() + float64(origin, gaussians.means))
 
 
 def float64(origin: Sequence[float], like: Tensor) -> Float[Tensor, "3"]:
-    """Return an origin as a tensor on the device of another."""
+    """Returns an origin as a tensor on the device of another."""
     return torch.tensor(list(origin), dtype=torch.float64, device=like.device)
 
 
 def rounding_at(positions: Float[Tensor, "P 3"]) -> float:
-    """Return the distance between neighbouring float32 numbers at the largest coordinate."""
+    """Returns the distance between neighbouring float32 numbers at the largest coordinate."""
     return float(np.spacing(np.float32(positions.abs().max()))) if len(positions) else 0.0
 
 
 def stored_in_single(positions: Float[Tensor, "P 3"]) -> bool:
-    """Return whether all positions are numbers of float32, as far doubles are by no accident."""
+    """Returns whether all positions are numbers of float32, as far doubles are by no accident."""
     return bool(len(positions)) and bool((positions.float().double() == positions.double()).all())
 
 
 def in_words(origin: Sequence[float]) -> str:
-    """Return an origin as text: (500000, 5400000, 300)."""
+    """Returns an origin as text: (500000, 5400000, 300)."""
     return f"({', '.join(number(value) for value in origin)})"
 
 
 def number(value: float) -> str:
-    """Return the shortest text that reads as the same float64; whole numbers without a point."""
+    """Returns the shortest text that reads as the same float64; whole numbers without a point."""
     return str(int(value)) if value == int(value) and abs(value) < 1e15 else repr(value)
 
 
 def comment_of(origin: Sequence[float]) -> str:
-    """Return the comment of a file that is written around an origin."""
+    """Returns the comment of a file that is written around an origin."""
     return f"gsx origin {' '.join(number(value) for value in origin)} (add it to positions, in double precision)"
 
 
 def stated_in(head: bytes) -> Origin:
-    """Return the origin that a file's first bytes state by `comment_of`; `NO_ORIGIN` where they state none."""
+    """Returns the origin that a file's first bytes state by `comment_of`; `NO_ORIGIN` where they state none."""
     found = STATED.search(head)
     try:
         x, y, z = (float(word) for word in found.groups()) if found else NO_ORIGIN

@@ -22,11 +22,7 @@ class PictureHeader:
 
 
 def header_of(content: bytes, name: str) -> PictureHeader:
-    """Return the header of a still picture.
-
-    Raises:
-        InputError: it is no WebP or PNG of 8 bits, an animation, or it ends early.
-    """
+    """Returns the header of a still picture."""
     try:
         if content.startswith(PNG):
             return png_header(content, name)
@@ -38,7 +34,7 @@ def header_of(content: bytes, name: str) -> PictureHeader:
 
 
 def png_header(content: bytes, name: str) -> PictureHeader:
-    """Return the header of a PNG; errors as `header_of`."""
+    """Returns the header of a PNG; errors as `header_of`."""
     width, height, depth = struct.unpack_from(">IIB", content, 16)
     if content[12:16] != b"IHDR" or depth != 8:
         raise InputError(f"'{name}' is no PNG of 8 bits: export it anew")
@@ -46,7 +42,7 @@ def png_header(content: bytes, name: str) -> PictureHeader:
 
 
 def webp_header(content: bytes, name: str) -> PictureHeader:
-    """Return the header of a WebP, whose pixels follow chunks of other kinds; errors as `header_of`."""
+    """Returns the header of a WebP, whose pixels follow chunks of other kinds; errors as `header_of`."""
     at, canvas = 12, None
     for _ in range(MOST_CHUNKS):
         kind, size = struct.unpack_from("<4sI", content, at)
@@ -66,11 +62,7 @@ def webp_header(content: bytes, name: str) -> PictureHeader:
 
 
 def still(size: tuple[int, int], canvas: tuple[int, ...] | None, name: str, lossless: bool) -> PictureHeader:
-    """Return the header of a picture that fills its canvas.
-
-    Raises:
-        InputError: it does not.
-    """
+    """Returns the header of a picture that fills its canvas."""
     if canvas is not None and canvas != size:
         raise InputError(f"'{name}' has a canvas of other size than its pixels: export it anew")
     return PictureHeader(width=size[0], height=size[1], lossless=lossless)

@@ -1,7 +1,7 @@
 """PLY files: tables of scalars by element, such as vertices of splats and of point clouds (3D-GS, save_ply).
 
 Reads ascii and both binary byte orders, writes binary little-endian. Other elements than the wanted one are skipped,
-also those before it and those with lists, such as faces.
+also those before it and those with lists, such as faces. Damaged content raises InputError, which calls the file "it".
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,11 +40,11 @@ class Element:
 
     @property
     def scalar(self) -> bool:
-        """Return whether no property is a list: all rows are of one size."""
+        """Returns whether no property is a list: all rows are of one size."""
         return not any(length for _, _, length in self.properties)
 
     def row(self, order: str, lengths: Sequence[int] = ()) -> np.dtype:
-        """Return the type of one row; `lengths`: of its lists, in order."""
+        """Returns the type of one row; `lengths`: of its lists, in order."""
         rest, fields = iter(lengths), []
         for number, (name, kind, length) in enumerate(self.properties):
             if length:
@@ -69,7 +69,7 @@ class Header:
 
 
 def read_ply(path: str | Path) -> dict[str, np.ndarray]:
-    """Return the vertex properties by name, each an array [vertices] of the type stored.
+    """Returns the vertex properties by name, each an array [vertices] of the type stored.
 
     Raises:
         InputError: the file is missing, is no PLY with vertices of scalars, or ends early.
@@ -85,7 +85,7 @@ def read_ply(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def vertices_of(content: bytes) -> dict[str, np.ndarray]:
-    """Return the vertex properties of a file's content, in native byte order.
+    """Returns the vertex properties of a file's content, in native byte order.
 
     Raises:
         InputError: as `read_ply`; the file is called "it".
@@ -105,22 +105,14 @@ def vertices_of(content: bytes) -> dict[str, np.ndarray]:
 
 
 def elements_of(content: bytes) -> dict[str, np.ndarray]:
-    """Return all elements of scalars by name, as structured arrays.
-
-    Raises:
-        InputError: it is no PLY, or ends early.
-    """
+    """Returns all elements of scalars by name, as structured arrays."""
     header = header_in(content)
     elements = enumerate(header.elements)
     return {element.name: table_at(content, header, i) for i, element in elements if element.scalar}
 
 
 def table_at(content: bytes, header: Header, position: int) -> np.ndarray:
-    """Return the rows of the element at a position, which has no lists.
-
-    Raises:
-        InputError: the file ends before them, or a row cannot be read.
-    """
+    """Returns the rows of the element at a position, which has no lists."""
     element = header.elements[position]
     if header.layout == "ascii":
         return _ascii(content[header.size :], header.elements[:position], element)
@@ -135,7 +127,7 @@ def table_at(content: bytes, header: Header, position: int) -> np.ndarray:
 
 
 def header_in(content: bytes) -> Header:
-    """Return the header of a file, which may have lost its body.
+    """Returns the header of a file, which may have lost its body.
 
     Raises:
         InputError: it has none, or one that contradicts itself.
@@ -151,17 +143,13 @@ def header_in(content: bytes) -> Header:
 
 
 def header_length(content: bytes) -> int:
-    """Return the bytes of a PLY's header; 0 where it has no end. A comment may hold the word that ends it."""
+    """Returns the bytes of a PLY's header; 0 where it has no end. A comment may hold the word that ends it."""
     end = content.find(HEADER_END)
     return content.find(b"\n", end + 1) + 1 if end >= 0 else 0
 
 
 def length_of(head: bytes) -> int:
-    """Return the bytes of the binary file that begins so, by its header.
-
-    Raises:
-        InputError: it has no complete header of a binary PLY of scalar properties.
-    """
+    """Returns the bytes of the binary file that begins so, by its header."""
     header = header_in(head)
     if header.layout == "ascii" or not all(element.scalar for element in header.elements):
         raise InputError("it has no header of a binary PLY of scalars: export it anew")
@@ -169,7 +157,7 @@ def length_of(head: bytes) -> int:
 
 
 def _elements(lines: list[list[str]]) -> Iterable[Element]:
-    """Yield the elements of a header."""
+    """Yields the elements of a header."""
     starts = [i for i, words in enumerate(lines) if words[:1] == ["element"]]
     names = set()
     for start, stop in pairwise([*starts, len(lines)]):
@@ -187,7 +175,7 @@ def _elements(lines: list[list[str]]) -> Iterable[Element]:
 
 
 def _property(words: list[str], element: str) -> tuple[str, str, str]:
-    """Return (name, type, type of a list's length) of a line of a header."""
+    """Returns (name, type, type of a list's length) of a line of a header."""
     if len(words) == 3 and words[1] in TYPES:
         return words[2], TYPES[words[1]], ""
     if len(words) == 5 and words[1] == "list" and {words[2], words[3]} <= TYPES.keys() and TYPES[words[2]][0] != "f":
@@ -196,11 +184,7 @@ def _property(words: list[str], element: str) -> tuple[str, str, str]:
 
 
 def _size(content: bytes, start: int, element: Element, order: str) -> int:
-    """Return the bytes of an element of a binary file.
-
-    Raises:
-        InputError: the file ends within it.
-    """
+    """Returns the bytes of an element of a binary file."""
     if element.scalar:
         return element.count * element.row(order).itemsize
     if not element.count:
@@ -219,11 +203,7 @@ def _size(content: bytes, start: int, element: Element, order: str) -> int:
 
 
 def _row_end(content: bytes, start: int, element: Element, order: str) -> tuple[int, list[int]]:
-    """Return the end of the row with lists that begins at a byte, and how long its lists are.
-
-    Raises:
-        InputError: the file ends within it.
-    """
+    """Returns the end of the row with lists that begins at a byte, and how long its lists are."""
     lengths: list[int] = []
     for _, kind, length in element.properties:
         if length and start + np.dtype(length).itemsize <= len(content):
@@ -236,7 +216,7 @@ def _row_end(content: bytes, start: int, element: Element, order: str) -> tuple[
 
 
 def _ascii(body: bytes, before: Sequence[Element], element: Element) -> np.ndarray:
-    """Return the rows of an element of a text file, one line each, after those of the elements before it."""
+    """Returns the rows of an element of a text file, one line each, after those of the elements before it."""
     first = sum(other.count for other in before)
     lines = [line for line in body.decode("latin-1").splitlines() if line.strip()][first : first + element.count]
     table = element.row("<")
@@ -288,7 +268,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def header_of(elements: Mapping[str, tuple[int, Mapping[str, str]]], comments: Iterable[str] = ()) -> bytes:
-    """Return the header of a binary file; elements: rows of each, and its properties with PLY's types."""
+    """Returns the header of a binary file; elements: rows of each, and its properties with PLY's types."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {plain(comment)}" for comment in comments)]
     for name, (count, properties) in elements.items():
         lines += [f"element {name} {count}", *(f"property {kind} {inner}" for inner, kind in properties.items())]
@@ -296,5 +276,5 @@ def header_of(elements: Mapping[str, tuple[int, Mapping[str, str]]], comments: I
 
 
 def plain(comment: str) -> str:
-    """Return a comment in one line of ASCII, all that headers may hold; other characters become escapes."""
+    """Returns a comment in one line of ASCII, all that headers may hold; other characters become escapes."""
     return " ".join(comment.split()).encode("ascii", "backslashreplace").decode()

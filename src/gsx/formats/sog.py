@@ -31,7 +31,7 @@ COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 
 
 def encode_sog(arrays: Arrays, antialiased: bool = False) -> bytes:
-    """A file. antialiased: to be drawn with compensated opacities, as models of Mip-Splatting.
+    """Encodes a file. antialiased: to be drawn with compensated opacities, as models of Mip-Splatting.
 
     Raises:
         InputError: there are no splats.
@@ -70,20 +70,20 @@ def encode_sog(arrays: Arrays, antialiased: bool = False) -> bytes:
 
 
 def signed_log(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """sign(x) ln(1 + |x|)."""
+    """Computes sign(x) ln(1 + |x|)."""
     return np.sign(values) * np.log1p(np.abs(values))
 
 
 def mean_words(
     logs: Float[np.ndarray, "N 3"], least: Float[np.ndarray, "3"], most: Float[np.ndarray, "3"]
 ) -> Int[np.ndarray, "N 3"]:
-    """Logarithms of positions in 16 bits."""
+    """Quantises logarithms of positions to 16 bits."""
     span = np.where(most > least, most - least, 1.0)
     return rounded(65535 * ((logs - least) / span)).clip(0, 65535).astype(np.int64)
 
 
 def quaternion_bytes(quats: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 4"]:
-    """The three smallest of (w, x, y, z), and in alpha which is the largest."""
+    """Packs the three smallest of (w, x, y, z), and in alpha the index of the largest."""
     largest, three = smallest_three(quats)
     return with_alpha(rounded(255 * (three * 0.5**0.5 + 0.5)).clip(0, 255), FIRST_LARGEST + largest)
 
@@ -91,14 +91,14 @@ def quaternion_bytes(quats: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 4"
 def with_alpha(
     colours: Float[np.ndarray, "N 3"] | Int[np.ndarray, "N 3"], alpha: Any = 255
 ) -> UInt8[np.ndarray, "N 4"]:
-    """RGBA of bytes."""
+    """Puts colours and alpha together as RGBA."""
     pixels = np.empty((len(colours), 4), np.uint8)
     pixels[:, :3], pixels[:, 3] = colours, alpha
     return pixels
 
 
 def raster(pixels: UInt8[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "H W 4"]:
-    """A picture with splat i at pixel i, about square, with spare pixels at the end."""
+    """Lays out a picture with splat i at pixel i, about square, with spare pixels at the end."""
     width = 4 * math.ceil(math.sqrt(len(pixels)) / 4)
     height = 4 * math.ceil(len(pixels) / width / 4)
     whole = np.zeros((width * height, 4), np.uint8)
@@ -107,7 +107,7 @@ def raster(pixels: UInt8[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "H W 4"]:
 
 
 def higher_bands(rest: Float[np.ndarray, "N B 3"]) -> tuple[dict[str, UInt8[np.ndarray, "H W 4"]], dict[str, Any]]:
-    """(pictures, entry of meta.json): a palette of vectors, and which of them each splat has."""
+    """Returns (pictures, entry of meta.json): a palette of vectors, and which of them each splat has."""
     count, coefficients, _ = rest.shape
     size = min(count, int(min(PALETTE, 2.0 ** math.floor(math.log2(count / 1024))) * 1024)) or 1
     vectors, labels = vector_book(rest.reshape(count, -1), size)
@@ -123,7 +123,7 @@ def higher_bands(rest: Float[np.ndarray, "N B 3"]) -> tuple[dict[str, UInt8[np.n
 
 
 def zipped(meta: dict[str, Any], pictures: dict[str, UInt8[np.ndarray, "H W 4"]]) -> bytes:
-    """The archive; nothing in it depends on the time."""
+    """Packs the archive; nothing in it depends on the time."""
     require("a .sog file", ("PIL",), "gsx[sog]")
     from PIL import Image
 

@@ -1,7 +1,8 @@
 """SOG, versions 1 and 2, from a ZIP or from a folder: meta.json and lossless pictures, a pixel a splat.
 
 Version 1 (playcanvas/sogs) holds scales, colours and logits of opacities as bytes between a least and a most value;
-version 2 (playcanvas/splat-transform) holds indices of code books. Pillow reads the pictures (`gsx[sog]`).
+version 2 (playcanvas/splat-transform) holds indices of code books. Pillow reads the pictures (`gsx[sog]`). Damaged
+content raises InputError, which calls the file "it".
 """
 
 import io
@@ -46,11 +47,7 @@ class Archive:
 
     @property
     def version(self) -> int:
-        """1 where meta.json states none.
-
-        Raises:
-            InputError: it is neither 1 nor 2.
-        """
+        """Returns the version, 1 where meta.json states none."""
         version = self.meta.get("version", 1)
         if version not in (1, VERSION) or isinstance(version, bool):
             raise InputError(f"its meta.json has version {version!r}; gsx reads SOG 1 and 2: export it anew")
@@ -58,11 +55,7 @@ class Archive:
 
     @property
     def count(self) -> int:
-        """Number of splats.
-
-        Raises:
-            InputError: meta.json states none, too many, or different ones.
-        """
+        """Returns the number of splats."""
         parts = (self.meta.get(part) for part in ("means", "scales", "quats", "sh0"))
         shapes = [part["shape"] for part in parts if isinstance(part, dict) and "shape" in part]
         stated = [self.meta["count"]] if "count" in self.meta else []
@@ -75,7 +68,7 @@ class Archive:
 
 
 def decode_sog(content: bytes, path: Path) -> Arrays:
-    """Return the splats of a ZIP, or of a meta.json and the pictures next to it. path: of the file.
+    """Returns the splats of a ZIP, or of a meta.json and the pictures next to it. path: of the file.
 
     Raises:
         InputError: it is damaged, of another version, or of flat splats.
@@ -94,7 +87,7 @@ def decode_sog(content: bytes, path: Path) -> Arrays:
 
 
 def sog_is_antialiased(path: Path) -> bool:
-    """Return whether meta.json states that opacities are compensated; False for what is no SOG.
+    """Returns whether meta.json states that opacities are compensated; False for what is no SOG.
 
     `model` (splat-transform since 3.2) counts before the older `antialias`.
     """
@@ -108,7 +101,7 @@ def sog_is_antialiased(path: Path) -> bool:
 
 
 def refuse_model(meta: dict[str, Any]) -> None:
-    """Raise InputError for flat splats; a model that gsx does not know is a warning."""
+    """Raises InputError for flat splats; a model that gsx does not know is a warning."""
     model = meta.get("model", "default")
     if model == FLAT:
         raise InputError(f"its meta.json has model '{FLAT}': it holds flat splats, which gsx does not draw")
@@ -117,11 +110,7 @@ def refuse_model(meta: dict[str, Any]) -> None:
 
 
 def archive_of(content: bytes, path: Path) -> Archive:
-    """Return the files of a ZIP, or of the folder of a meta.json. path: of the file with that content.
-
-    Raises:
-        InputError: it is no ZIP, or has no readable meta.json.
-    """
+    """Returns the files of a ZIP, or of the folder of a meta.json. path: of the file with that content."""
     read = in_folder(path) if path.name.lower() == META else in_zip(content)
     try:
         meta = json.loads(read(META, MOST_META))
@@ -133,7 +122,7 @@ def archive_of(content: bytes, path: Path) -> Archive:
 
 
 def in_folder(path: Path) -> Callable[[str, int], bytes]:
-    """Return a reader of the files next to a meta.json."""
+    """Returns a reader of the files next to a meta.json."""
 
     def read(name: str, most: int) -> bytes:
         file = path if name == META else path.parent / name
@@ -149,7 +138,7 @@ def in_folder(path: Path) -> Callable[[str, int], bytes]:
 
 
 def in_zip(content: bytes) -> Callable[[str, int], bytes]:
-    """Return a reader of the files of a ZIP, which lie in its root or all in one folder.
+    """Returns a reader of the files of a ZIP, which lie in its root or all in one folder.
 
     Raises:
         InputError: it is no ZIP, or has no or several meta.json.
@@ -177,7 +166,7 @@ def in_zip(content: bytes) -> Callable[[str, int], bytes]:
 
 
 def folder_of_meta(names: list[str]) -> PurePosixPath:
-    """Return the folder of a ZIP in which meta.json lies.
+    """Returns the folder of a ZIP in which meta.json lies.
 
     Raises:
         InputError: there is none, or several.
@@ -192,7 +181,7 @@ def folder_of_meta(names: list[str]) -> PurePosixPath:
 
 
 def splats_in(archive: Archive) -> Arrays:
-    """Return the splats of the files; damaged content raises errors of many kinds."""
+    """Returns the splats of the files; damaged content raises errors of many kinds."""
     meta, count = archive.meta, archive.count
     first = archive.version == 1
     least, most = (np.array(meta["means"][end], float) for end in ("mins", "maxs"))
@@ -212,7 +201,7 @@ def splats_in(archive: Archive) -> Arrays:
 
 
 def interpolated(entry: dict[str, Any], stored: UInt8[np.ndarray, "N k"]) -> Float[np.ndarray, "N k"]:
-    """Return values of version 1: bytes between the least and the most of each column."""
+    """Returns values of version 1: bytes between the least and the most of each column."""
     least, most = (np.array(entry[end], float) for end in ("mins", "maxs"))
     if least.shape not in ((), (1,), stored.shape[1:]) or most.shape != least.shape:
         raise InputError(f"its ranges are of {least.size} columns, its picture has {stored.shape[1]}: export it anew")
@@ -220,12 +209,12 @@ def interpolated(entry: dict[str, Any], stored: UInt8[np.ndarray, "N k"]) -> Flo
 
 
 def looked_up(entry: dict[str, Any], indices: UInt8[np.ndarray, "N k"]) -> Float[np.ndarray, "N k"]:
-    """Return values of version 2: entries of a code book."""
+    """Returns values of version 2: entries of a code book."""
     return code_book(entry)[indices]
 
 
 def code_book(entry: dict[str, Any]) -> Float[np.ndarray, "E"]:
-    """Return a code book; a first entry that is null, as early writers left it, continues the steps of the others."""
+    """Returns a code book; a first entry that is null, as early writers left it, continues the steps of the others."""
     book = np.array(entry["codebook"], float)
     if len(book) == BOOK and entry["codebook"][0] is None:
         book[0] = book[1] + (book[1] - book[-1]) / (BOOK - 1)
@@ -233,7 +222,7 @@ def code_book(entry: dict[str, Any]) -> Float[np.ndarray, "E"]:
 
 
 def quaternions(entry: dict[str, Any], stored: UInt8[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
-    """Return unit quaternions (w, x, y, z); an alpha that names no component stands for the identity."""
+    """Returns unit quaternions (w, x, y, z); an alpha that names no component stands for the identity."""
     encoding = entry.get("encoding", "quaternion_packed")
     if encoding != "quaternion_packed":
         raise InputError(f"its quaternions are encoded as {encoding!r}; gsx reads quaternion_packed: export it anew")
@@ -243,7 +232,7 @@ def quaternions(entry: dict[str, Any], stored: UInt8[np.ndarray, "N 4"]) -> Floa
 
 
 def rest_of(archive: Archive) -> Float[np.ndarray, "N B 3"]:
-    """Return coefficients of higher bands: of a palette of vectors, the one that a splat's label names."""
+    """Returns coefficients of higher bands: of a palette of vectors, the one that a splat's label names."""
     entry = archive.meta["shN"]
     centroids = picture(archive, entry["files"][0], 1)
     bands = {64 * count: count for count in COEFFICIENTS.values()}
@@ -264,17 +253,13 @@ def rest_of(archive: Archive) -> Float[np.ndarray, "N B 3"]:
 
 
 def pixels(archive: Archive, part: str, number: int = 0) -> UInt8[np.ndarray, "N 4"]:
-    """Return the pixels of all splats in a picture of a part of meta.json."""
+    """Returns the pixels of all splats in a picture of a part of meta.json."""
     name = archive.meta[part]["files"][number]
     return picture(archive, name, archive.count).reshape(-1, 4)[: archive.count]
 
 
 def picture(archive: Archive, name: str, needed: int) -> UInt8[np.ndarray, "H W 4"]:
-    """Return a lossless picture as RGBA; needed: its least number of pixels.
-
-    Raises:
-        InputError: it has fewer or far more, or is lossy or damaged.
-    """
+    """Returns a lossless picture as RGBA; needed: its least number of pixels."""
     from PIL import Image
 
     most = 4 * max(needed, archive.count) + SPARE_PIXELS
@@ -295,11 +280,7 @@ def picture(archive: Archive, name: str, needed: int) -> UInt8[np.ndarray, "H W 
 
 
 def finite(arrays: Arrays) -> Arrays:
-    """Return splats whose values are all finite.
-
-    Raises:
-        InputError: they are not.
-    """
+    """Returns splats whose values are all finite."""
     for name, values in vars(arrays).items():
         if not np.isfinite(values).all():
             raise InputError(f"its ranges or code books give '{name}' that are not finite: export it anew")

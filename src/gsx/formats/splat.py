@@ -20,7 +20,7 @@ SMALLEST_SCALE = 1e-30
 
 
 def decode_splat(content: bytes) -> Arrays:
-    """Return the splats of a file; rows may hold values that are not finite.
+    """Returns the splats of a file; rows may hold values that are not finite.
 
     Raises:
         InputError: it is empty, or no whole number of rows long.
@@ -43,11 +43,11 @@ def decode_splat(content: bytes) -> Arrays:
 
 
 def log_scales_of(scales: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """Return logarithms of linear scales; those of negative ones are nan."""
+    """Returns logarithms of linear scales; those of negative ones are nan."""
     with np.errstate(invalid="ignore"):
         return np.log(np.where(scales == 0, SMALLEST_SCALE, scales))
 
 
 def constants_of(colours: UInt8[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """Return coefficients of the constant band of colours in bytes."""
+    """Returns coefficients of the constant band of colours in bytes."""
     return (colours / 255 - 0.5) / BAND_0

@@ -13,7 +13,7 @@ from gsx.core.errors import InputError
 from gsx.core.files import refuse_lfs_pointer
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float
-from gsx.formats.arrays import Arrays, arrays_of, gaussians_from
+from gsx.formats.arrays import Arrays, arrays_of, finite_rows, gaussians_from
 from gsx.formats.axes import to_training_axes
 from gsx.formats.axis_names import AUTO, CHOICES, EXAMPLES, FIXED, SPECIFIED, TRAINED
 from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply
@@ -26,7 +26,7 @@ from gsx.formats.sog import encode_sog
 from gsx.formats.sog_reading import decode_sog, sog_is_antialiased
 from gsx.formats.splat import decode_splat
 from gsx.formats.spz import decode_spz, encode_spz, is_antialiased
-from gsx.formats.standard_ply import decode_standard_ply, finite_rows
+from gsx.formats.standard_ply import decode_standard_ply
 from gsx.formats.suffixes import SPZ_VERSIONS, STANDARD, splat_file_at, suffix_of
 
 logger = logging.getLogger(__name__)
@@ -42,7 +42,7 @@ REASONS = {"given": "given", "stated": "the file states"}
 
 
 def columns_of(gaussians: Gaussians) -> dict[str, Float[Tensor, "N"]]:
-    """Properties by name in file order; f_rest is channel-major: all red coefficients, then green, then blue."""
+    """Returns properties by name in file order; f_rest is channel-major: all red, then green, then blue."""
     rest = gaussians.sh_rest.transpose(1, 2).flatten(1)
     zeros = torch.zeros_like(gaussians.opacity_logits)
     columns = dict(zip("xyz", gaussians.means.unbind(1), strict=True))
@@ -65,7 +65,7 @@ class SpzForm:
     """The specification's, rub, or the training world's, rdf."""
 
     def __post_init__(self) -> None:
-        """Raise InputError for what is not written."""
+        """Raises InputError for what is not written."""
         if self.version not in SPZ_VERSIONS:
             raise InputError(f"the version of SPZ is {self.version!r}: choose {' or '.join(map(str, SPZ_VERSIONS))}")
         if self.axes not in (SPECIFIED, TRAINED):
@@ -80,7 +80,7 @@ def write_gaussians(
     spz: SpzForm = SpzForm(),
     origin: Origin = NO_ORIGIN,
 ) -> None:
-    """Write a splat file of the kind that its suffix says. compensated: opacities are, when it is drawn; origin: added
+    """Writes a splat file of the kind that its suffix says. compensated: opacities are, when it is drawn; origin: added
     to positions, in float64.
 
     Raises:
@@ -96,19 +96,15 @@ def write_gaussians(
         turned = to_training_axes(away(gaussians, origin), spz.axes)  # a turn by 180 degrees goes both ways
         write_whole(path, encode_spz(arrays_of(turned), compensated, spz.version, spz.axes))
     else:
-        write_compact(path, suffix, arrays_of(away(gaussians, origin)), comments, compensated)
-
-
-def write_compact(path: Path, suffix: str, arrays: Arrays, comments: Sequence[str], compensated: bool) -> None:
-    """Write a splat file that is neither a standard PLY nor SPZ; errors as `write_gaussians`."""
-    content = encode_sog(arrays, compensated) if suffix == ".sog" else encode_compressed_ply(arrays, comments)
-    write_whole(path, content)
+        arrays = arrays_of(away(gaussians, origin))
+        compact = encode_sog(arrays, compensated) if suffix == ".sog" else encode_compressed_ply(arrays, comments)
+        write_whole(path, compact)
 
 
 def write_columns(
     path: Path, values: dict[str, Float[Tensor, "N"]], comments: Sequence[str] = (), origin: Origin = NO_ORIGIN
 ) -> None:
-    """Write a splat file of any properties. origin: added to x, y and z, which are doubles then; errors as
+    """Writes a splat file of any properties. origin: added to x, y and z, which are doubles then; errors as
     `write_gaussians`."""
     columns = {name: value.detach().float().cpu().numpy() for name, value in values.items()}
     for name, value in columns.items():
@@ -135,7 +131,7 @@ class SplatContent:
 
 
 def read_gaussians(path: Path, axes: str = AUTO, origin: Origin = NO_ORIGIN) -> Gaussians:
-    """Read a splat file of any SH degree, of the format that its first bytes show, and log axes that are in doubt.
+    """Reads a splat file of any SH degree, of the format that its first bytes show, and log axes that are in doubt.
 
     axes: one of `axis_names.CHOICES`; origin: subtracted from positions in float64.
 
@@ -146,8 +142,7 @@ def read_gaussians(path: Path, axes: str = AUTO, origin: Origin = NO_ORIGIN) -> 
 
 
 def read_around(path: Path, axes: str = AUTO, base: Origin = NO_ORIGIN) -> tuple[Gaussians, Origin]:
-    """Read a splat file as (Gaussians around an origin of their own, that origin), where coordinates count from `base`;
-    errors as `read_gaussians`."""
+    """Reads a splat file as (Gaussians around an origin of their own, that origin); coordinates count from `base`."""
     x, y, z = base
     gaussians = away(read_in_double(path, axes), (-x, -y, -z))
     origin = origin_of_positions(gaussians.means)
@@ -155,14 +150,14 @@ def read_around(path: Path, axes: str = AUTO, base: Origin = NO_ORIGIN) -> tuple
 
 
 def read_in_double(path: Path, axes: str = AUTO) -> Gaussians:
-    """Read a splat file as `read_gaussians`, with means in float64; the origin that a file states is added to them."""
+    """Reads a splat file as `read_gaussians`, with means in float64; the origin that a file states is added to them."""
     content = read_splats(path, axes)
     log_axes(content)
     return content.gaussians
 
 
 def read_splats(path: Path, axes: str = AUTO) -> SplatContent:
-    """Read a splat file without a word on its axes; errors as `read_gaussians`."""
+    """Reads a splat file without a word on its axes; errors as `read_gaussians`."""
     if axes not in CHOICES:
         raise InputError(f"axes is {axes!r}: choose {EXAMPLES}")
     path = splat_file_at(path)
@@ -185,7 +180,7 @@ def read_splats(path: Path, axes: str = AUTO) -> SplatContent:
 
 
 def kind_of(content: bytes, path: Path) -> str:
-    """Return which of SUFFIXES a file is; where its name says otherwise, the log does."""
+    """Returns which of SUFFIXES a file is; where its name says otherwise, the log does."""
     kind = format_of(content[:MOST_HEADER], path)
     if kind != format_of(b"", path):
         logger.info("%s is read as %s, which its first bytes show", path, kind)
@@ -193,14 +188,14 @@ def kind_of(content: bytes, path: Path) -> str:
 
 
 def usual_axes(kind: str) -> tuple[str, str]:
-    """Return (axes of files of one of SUFFIXES that state none, why)."""
+    """Returns (axes of files of one of SUFFIXES that state none, why)."""
     if kind == ".spz":
         return SPECIFIED, "specified"
     return TRAINED, FIXED if kind == ".glb" else "conventional"
 
 
 def log_axes(content: SplatContent) -> None:
-    """Log which axes a file was taken to hold, and the remedy if that is wrong; nothing where its format fixes them."""
+    """Logs the axes that a file is taken to have and the remedy if they are wrong, unless its format fixes them."""
     if content.by == "specified":
         logger.info(
             "%s: axes %s, as SPZ specifies; the file states none. Where it lies upside down or out of view, give axes "
@@ -212,40 +207,32 @@ def log_axes(content: SplatContent) -> None:
 
 
 def decode(content: bytes, kind: str, name: str) -> tuple[Gaussians, str | None]:
-    """Return (splats of a file's content, means in float64; axes that it states, if any).
+    """Returns (splats of a file's content, means in float64; axes that it states, if any).
 
     kind: one of SUFFIXES; name: of the file, for the log.
-
-    Raises:
-        InputError: it is damaged, or lacks a property.
     """
     if kind == ".spz":
         arrays, stated = decode_spz(content)
         return in_double(arrays), stated
-    return decode_trained(content, kind, name), None
-
-
-def decode_trained(content: bytes, kind: str, name: str) -> Gaussians:
-    """Return the splats of a file whose format has the axes of training worlds, or is turned; errors as `decode`."""
     if kind == STANDARD:
-        return decode_standard_ply(content, name)
+        return decode_standard_ply(content, name), None
     if kind == ".glb":
-        return in_double(decode_glb(content, name, Path(name).parent))
+        return in_double(decode_glb(content, name, Path(name).parent)), None
     if kind == ".sog":
-        return in_double(decode_sog(content, Path(name)))
+        return in_double(decode_sog(content, Path(name))), None
     with np.errstate(over="ignore", invalid="ignore"):  # rows that are not finite are left out
         gaussians = in_double(DECODERS[kind](content))
-    return Gaussians(**finite_rows(vars(gaussians), name))
+    return Gaussians(**finite_rows(vars(gaussians), name)), None
 
 
 def in_double(arrays: Arrays) -> Gaussians:
-    """Return Gaussians of arrays, means in float64; those that float32 cannot hold are NaN."""
+    """Returns Gaussians of arrays, means in float64; those that float32 cannot hold are NaN."""
     gaussians, means = gaussians_from(arrays), torch.from_numpy(arrays.means)
     return replace(gaussians, means=torch.where(gaussians.means.isfinite(), means, torch.nan))
 
 
 def compensated(path: Path) -> bool:
-    """Return whether a file says that opacities are compensated when it is drawn, as Mip-Splatting has it.
+    """Returns whether a file says that opacities are compensated when it is drawn, as Mip-Splatting has it.
 
     SPZ has a flag for it, SOG an entry (`sog_is_antialiased`); PLY a comment, `SplatRenderMode: mip` (Brush,
     SuperSplat) or `antialiased 1` (Postshot), of which the last counts. `.splat` and `.ksplat` do not say.
@@ -276,7 +263,7 @@ def compensated(path: Path) -> bool:
 
 
 def is_linear(path: Path) -> bool:
-    """Return whether a splat file that can be read has colours of linear light, which became sRGB."""
+    """Returns whether a splat file that can be read has colours of linear light, which became sRGB."""
     with splat_file_at(path).open("rb") as file:
         head = file.read(MOST_HEADER)
         return format_of(head, path) == ".glb" and names_linear(head + file.read())

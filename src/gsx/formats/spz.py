@@ -33,7 +33,7 @@ ROOT_2 = 2**0.5
 
 
 def encode_spz(arrays: Arrays, antialiased: bool = False, version: int = 3, axes: str = SPECIFIED) -> bytes:
-    """Return a file. antialiased: to be drawn with compensated opacities, as models of Mip-Splatting.
+    """Returns a file. antialiased: to be drawn with compensated opacities, as models of Mip-Splatting.
 
     axes: which the arrays are in; a file of version 4 states them.
 
@@ -61,7 +61,7 @@ def encode_spz(arrays: Arrays, antialiased: bool = False, version: int = 3, axes
 
 
 def packed_arrays(arrays: Arrays) -> list[bytes]:
-    """Return the bytes of positions, opacities, colours, scales, rotations, coefficients."""
+    """Returns the bytes of positions, opacities, colours, scales, rotations, coefficients."""
     positions = rounded(arrays.means * 2**FRACTION_BITS).astype("<i4")
     parts = [
         np.ascontiguousarray(positions).view(np.uint8).reshape(-1, 4)[:, :3],
@@ -75,7 +75,7 @@ def packed_arrays(arrays: Arrays) -> list[bytes]:
 
 
 def packed_rotations(quats: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 4"]:
-    """Return 4 bytes a quaternion (w, x, y, z): the three smallest of x, y, z, w by sign and magnitude."""
+    """Returns 4 bytes a quaternion (w, x, y, z): the three smallest of x, y, z, w by sign and magnitude."""
     largest, three = smallest_three(quats[:, [1, 2, 3, 0]])
     fields = np.floor(511 * np.abs(three) * ROOT_2 + 0.5).clip(0, 511).astype(np.uint32) + 512 * (three < 0)
     words = (largest << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]).astype("<u4")
@@ -83,18 +83,18 @@ def packed_rotations(quats: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 4"
 
 
 def as_bytes(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
-    """Whole numbers as bytes, those beyond at the limits."""
+    """Clamps whole numbers to bytes."""
     return values.clip(0, 255).astype(np.uint8)
 
 
 def coarse(sh_rest: Float[np.ndarray, "N B 3"]) -> UInt8[np.ndarray, "N B 3"]:
-    """Coefficients within [-1, 1], of degree 1 to 5 bits, of higher ones to 4, so that gzip finds less."""
+    """Quantises coefficients within [-1, 1], of degree 1 to 5 bits, of higher ones to 4, so that gzip finds less."""
     steps = np.array([8] * 3 + [16] * 12)[: sh_rest.shape[1], None]
     return as_bytes(np.trunc((rounded(128 * sh_rest) + 128 + steps / 2) / steps) * steps)
 
 
 def decode_spz(content: bytes) -> tuple[Arrays, str | None]:
-    """Return (splats of a file of version 2, 3 or 4 in its own axes, the axes that it states, if any).
+    """Returns (splats of a file of version 2, 3 or 4 in its own axes, the axes that it states, if any).
 
     Bands beyond degree 3 are left out.
 
@@ -116,14 +116,14 @@ def decode_spz(content: bytes) -> tuple[Arrays, str | None]:
 
 
 def positions_of(packed: UInt8[np.ndarray, "N 9"]) -> Int[np.ndarray, "N 3"]:
-    """Return whole numbers of 24 bits with their signs."""
+    """Returns whole numbers of 24 bits with their signs."""
     words = np.zeros((len(packed), 3, 4), np.uint8)
     words[..., 1:] = packed.reshape(-1, 3, 3)
     return words.reshape(-1, 12).view("<i4") >> 8
 
 
 def is_antialiased(head: bytes) -> bool:
-    """Return whether the header says that opacities are compensated; False for what is no SPZ."""
+    """Returns whether the header says that opacities are compensated; False for what is no SPZ."""
     try:
         header = head if head[:4] == MAGIC else unzipped(head, HEADER.size)
     except InputError:
@@ -132,7 +132,7 @@ def is_antialiased(head: bytes) -> bool:
 
 
 def rotations(packed: UInt8[np.ndarray, "N b"]) -> Float[np.ndarray, "N 4"]:
-    """Quaternions (w, x, y, z) of 4 bytes (from version 3 on: the three smallest) or 3 (version 2: x, y, z, w >= 0)."""
+    """Unpacks quaternions (w, x, y, z) of 4 bytes (the three smallest) or, in version 2, 3 (x, y, z; w >= 0)."""
     if packed.shape[1] == 3:
         three = packed / 127.5 - 1
         w = np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))

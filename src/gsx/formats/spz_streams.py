@@ -1,6 +1,7 @@
 """Containers of SPZ: what stands around the arrays in versions 2 and 3 (one gzip stream) and 4 (streams of Zstandard).
 
-Source: nianticlabs/spz, load-spz.cc and extensions/README.md (MIT), revision 21715c3.
+Source: nianticlabs/spz, load-spz.cc and extensions/README.md (MIT), revision 21715c3. Damaged content raises
+InputError, which calls the file "it".
 """
 
 import gzip
@@ -48,11 +49,11 @@ class Header(NamedTuple):
     """Number of streams in version 4; 0 before."""
 
     def sizes(self) -> list[int]:
-        """Return bytes a splat of positions, opacities, colours, scales, rotations, coefficients."""
+        """Returns bytes a splat of positions, opacities, colours, scales, rotations, coefficients."""
         return [POSITION_BYTES, 1, 3, 3, 4 if self.version >= SMALLEST_THREE else 3, 3 * COEFFICIENTS[self.degree]]
 
     def packed(self) -> bytes:
-        """Return the bytes, with the magic."""
+        """Returns the bytes, with the magic."""
         return HEADER.pack(MAGIC, *self)
 
 
@@ -68,7 +69,7 @@ class Content:
 
 
 def read_content(content: bytes) -> Content:
-    """Read a file of version 2, 3 or 4.
+    """Reads a file of version 2, 3 or 4.
 
     Raises:
         InputError: it is damaged, of another version, or no SPZ.
@@ -77,11 +78,7 @@ def read_content(content: bytes) -> Content:
 
 
 def header_of(data: bytes, size: int) -> Header:
-    """Read a header; `size`: bytes of the file, compressed.
-
-    Raises:
-        InputError: it is none, of a version that is not read, or claims more than the file can hold.
-    """
+    """Reads a header; `size`: bytes of the file, compressed."""
     if len(data) < HEADER.size or data[:4] != MAGIC:
         raise InputError("it is no SPZ, or ends within its header: export it anew")
     header = Header(*HEADER.unpack_from(data)[1:])
@@ -97,7 +94,7 @@ def header_of(data: bytes, size: int) -> Header:
 
 
 def refuse_version(version: int) -> None:
-    """Raise InputError for a version that is not read."""
+    """Raises InputError for a version that is not read."""
     if version == 1:
         raise InputError("it is SPZ version 1, which was never published, gsx reads 2, 3 and 4: export it anew")
     if version not in (2, 3, STREAMED):
@@ -108,7 +105,7 @@ def refuse_version(version: int) -> None:
 
 
 def gzipped_content(content: bytes) -> Content:
-    """Read a file of version 2 or 3; errors as `read_content`."""
+    """Reads a file of version 2 or 3; errors as `read_content`."""
     header = header_of(unzipped(content, HEADER.size), len(content))
     if header.version >= STREAMED:
         raise InputError(f"it is SPZ version {header.version} within a gzip stream: unzip it (gzip -d)")
@@ -121,11 +118,7 @@ def gzipped_content(content: bytes) -> Content:
 
 
 def unzipped(content: bytes, most: int) -> bytes:
-    """Return so many bytes of a gzip stream, or all that it has.
-
-    Raises:
-        InputError: it is none, or damaged.
-    """
+    """Returns so many bytes of a gzip stream, or all that it has."""
     try:
         return zlib.decompressobj(wbits=31).decompress(content, most)
     except zlib.error as error:
@@ -133,7 +126,7 @@ def unzipped(content: bytes, most: int) -> bytes:
 
 
 def split(data: bytes, sizes: Sequence[int]) -> tuple[list[bytes], bytes]:
-    """Return (parts of these sizes, what follows them)."""
+    """Returns (parts of these sizes, what follows them)."""
     parts, begin = [], 0
     for size in sizes:
         parts.append(data[begin : begin + size])
@@ -142,7 +135,7 @@ def split(data: bytes, sizes: Sequence[int]) -> tuple[list[bytes], bytes]:
 
 
 def gzipped(header: Header, arrays: Sequence[bytes]) -> bytes:
-    """Return a file of version 2 or 3."""
+    """Returns a file of version 2 or 3."""
     return gzip.compress(header.packed() + b"".join(arrays), mtime=0)
 
 
@@ -150,7 +143,7 @@ def gzipped(header: Header, arrays: Sequence[bytes]) -> bytes:
 
 
 def streamed_content(content: bytes) -> Content:
-    """Read a file that begins with its header; errors as `read_content`."""
+    """Reads a file that begins with its header; errors as `read_content`."""
     header = header_of(content, len(content))
     if header.version < STREAMED:
         raise InputError(f"it is the content of SPZ version {header.version} without its gzip stream: gzip it")
@@ -165,11 +158,7 @@ def streamed_content(content: bytes) -> Content:
 
 
 def table_entries(content: bytes, table: int, header: Header, sizes: Sequence[int]) -> list[tuple[bytes, int]]:
-    """Return (compressed bytes, size) of each stream; `table`: where their table begins.
-
-    Raises:
-        InputError: the table contradicts the header, or the file's length.
-    """
+    """Returns (compressed bytes, size) of each stream; `table`: where their table begins."""
     begin = table + len(sizes) * ENTRY.size
     if header.streams != len(sizes) or table < STREAMED_HEADER or begin > len(content):
         raise InputError(
@@ -187,11 +176,7 @@ def table_entries(content: bytes, table: int, header: Header, sizes: Sequence[in
 
 
 def streamed(header: Header, arrays: Sequence[bytes], axes: str) -> bytes:
-    """Return a file of version 4 that states its axes.
-
-    Raises:
-        InputError: there is no Zstandard here.
-    """
+    """Returns a file of version 4 that states its axes."""
     parts = [part for part in arrays if part]
     streams = [compress(part) for part in parts]
     record = RECORD.pack(COORDINATE_SYSTEM, TABLE.size) + TABLE.pack(SYSTEMS.index(axes) + 1)
@@ -204,7 +189,7 @@ def streamed(header: Header, arrays: Sequence[bytes], axes: str) -> bytes:
 
 
 def records_of(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Iterate over (type, payload) of extensions, up to one that is cut off."""
+    """Iterates over (type, payload) of extensions, up to one that is cut off."""
     while len(data) >= RECORD.size:
         kind, size = RECORD.unpack_from(data)
         payload, data = data[RECORD.size : RECORD.size + size], data[RECORD.size + size :]
@@ -213,11 +198,7 @@ def records_of(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def stated_axes(records: bytes) -> str | None:
-    """Return the axes that extensions state; None: they state none, or number 0, which means none.
-
-    Raises:
-        InputError: a number that no axes have.
-    """
+    """Returns the axes that extensions state; None: they state none, or number 0, which means none."""
     for kind, payload in records_of(records):
         if kind == COORDINATE_SYSTEM and len(payload) >= TABLE.size:
             (number,) = TABLE.unpack_from(payload)

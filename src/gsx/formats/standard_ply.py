@@ -2,6 +2,7 @@
 
 Colours may be display RGB (nerfstudio), an opacity may be an alpha channel, bands beyond degree 3 are left out. A 3D
 filter next to the scales is fused (Mip-Splatting, training). Rows that are not finite are left out, as by viewers.
+Other content raises InputError, which calls the file "it".
 """
 
 import logging
@@ -17,7 +18,7 @@ from gsx.core.gaussians.smoothing import smoothed_raw
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float
 from gsx.formats.activated import activated_words
-from gsx.formats.arrays import SMALLEST_OPACITY
+from gsx.formats.arrays import SMALLEST_OPACITY, finite_rows
 from gsx.formats.colours import COLOUR_NAMES, colours_among, full_scale_of
 from gsx.formats.ply import header_in, vertices_of
 
@@ -45,7 +46,7 @@ ANCHORS = ("f_anchor_feat_0", "f_offset_0")
 
 @np.errstate(over="ignore", invalid="ignore")  # rows with NaN of any kind, or beyond float32, are left out
 def decode_standard_ply(content: bytes, name: str) -> Gaussians:
-    """Return the splats of a file's content, means in float64. name: of the file, for the log.
+    """Returns the splats of a file's content, means in float64. name: of the file, for the log.
 
     Raises:
         InputError: it is damaged, or holds no splats of 3D-GS.
@@ -72,12 +73,12 @@ def decode_standard_ply(content: bytes, name: str) -> Gaussians:
 
 
 def in_double(columns: Columns) -> Float[Tensor, "N 3"]:
-    """Return positions as a file has them."""
+    """Returns positions as a file has them."""
     return torch.from_numpy(np.stack([columns[axis].astype(float) for axis in "xyz"], 1))
 
 
 def problem_of(columns: Columns, content: bytes) -> str:
-    """Return why vertices are no splats of 3D-GS, in words; empty: they are."""
+    """Returns why vertices are no splats of 3D-GS, in words; empty: they are."""
     needed = ["x", "y", "z", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     missing = [f"'{name}'" for name in needed if name not in columns]
     if not {"opacity", "alpha"} & columns.keys():
@@ -90,7 +91,7 @@ def problem_of(columns: Columns, content: bytes) -> str:
 
 
 def form_of(columns: Columns, content: bytes) -> str:
-    """Return what vertices that are no splats probably are, and a remedy."""
+    """Returns what vertices that are no splats probably are, and a remedy."""
     for names, form in FORMS.items():
         if set(names) <= columns.keys():
             return form
@@ -106,22 +107,18 @@ def form_of(columns: Columns, content: bytes) -> str:
 
 
 def float_column(columns: Columns, name: str) -> Float[Tensor, "N"]:
-    """Return a property as float32; doubles beyond it become infinite."""
+    """Returns a property as float32; doubles beyond it become infinite."""
     with np.errstate(over="ignore", invalid="ignore"):
         return torch.from_numpy(columns[name].astype(np.float32))
 
 
 def stacked(columns: Columns, *names: str) -> Float[Tensor, "N k"]:
-    """Return properties side by side."""
+    """Returns properties side by side."""
     return torch.stack([float_column(columns, name) for name in names], 1)
 
 
 def opacity_logits(columns: Columns, file: str) -> Float[Tensor, "N"]:
-    """Return logits of opacities: as stored, or of an alpha channel of any unit.
-
-    Raises:
-        InputError: alpha is of no known unit.
-    """
+    """Returns logits of opacities: as stored, or of an alpha channel of any unit."""
     if "opacity" in columns:
         return float_column(columns, "opacity").nan_to_num(torch.nan, MOST_LOGIT, -MOST_LOGIT)
     alpha = scaled_by(columns["alpha"], "alpha").clamp(SMALLEST_OPACITY, 1 - SMALLEST_OPACITY)
@@ -130,11 +127,7 @@ def opacity_logits(columns: Columns, file: str) -> Float[Tensor, "N"]:
 
 
 def constant_band(columns: Columns) -> Float[Tensor, "N 3"]:
-    """Return coefficients of the constant band: as stored, or of display RGB.
-
-    Raises:
-        InputError: RGB is of no known unit.
-    """
+    """Returns coefficients of the constant band: as stored, or of display RGB."""
     if "f_dc_0" in columns:
         missing = [name for name in ("f_dc_1", "f_dc_2") if name not in columns]
         if missing:
@@ -146,11 +139,7 @@ def constant_band(columns: Columns) -> Float[Tensor, "N 3"]:
 
 
 def scaled_by(values: np.ndarray, name: str) -> Float[Tensor, "..."]:
-    """Return intensities as shares of full intensity.
-
-    Raises:
-        InputError: their unit cannot be known.
-    """
+    """Returns intensities as shares of full intensity."""
     full = full_scale_of(values)
     if full is None:
         ends = f"{np.nanmin(values):g} to {np.nanmax(values):g}"
@@ -160,11 +149,7 @@ def scaled_by(values: np.ndarray, name: str) -> Float[Tensor, "..."]:
 
 
 def higher_bands(columns: Columns) -> Float[Tensor, "N B 3"]:
-    """Return coefficients next to the constant one, up to degree 3; f_rest is channel-major.
-
-    Raises:
-        InputError: there are not as many as any degree has.
-    """
+    """Returns coefficients next to the constant one, up to degree 3; f_rest is channel-major."""
     count = sum(name.startswith("f_rest_") for name in columns)
     if count not in (3 * ((degree + 1) ** 2 - 1) for degree in range(5)):
         raise InputError(f"it has {count} f_rest properties, degrees 0 to 4 have 0, 9, 24, 45 or 72: export it anew")
@@ -173,14 +158,3 @@ def higher_bands(columns: Columns) -> Float[Tensor, "N B 3"]:
         raise InputError(f"it does not number its f_rest properties from 0 to {count - 1}: export it anew")
     values = stacked(columns, *names) if names else torch.zeros(rows, 0)
     return values.view(rows, 3, count // 3).transpose(1, 2)[:, :MOST_COEFFICIENTS]
-
-
-def finite_rows(raw: dict[str, Tensor], file: str) -> dict[str, Tensor]:
-    """Return the rows that are finite in everything; log how many others there were."""
-    finite = torch.stack([torch.isfinite(value).flatten(1).all(1) if value.ndim > 1 else torch.isfinite(value)
-                          for value in raw.values()]).all(0)  # fmt: skip
-    if bool(finite.all()):
-        return raw
-    logger.warning("%s: %d of %d splats have values that are not finite, and are left out", file,
-                   int((~finite).sum()), len(finite))  # fmt: skip
-    return {name: value[finite] for name, value in raw.items()}

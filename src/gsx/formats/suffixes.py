@@ -23,7 +23,7 @@ SPZ_VERSIONS = (3, 4)
 
 
 def suffix_of(path: Path) -> str:
-    """Return which of SUFFIXES a name has; empty if none. The META of an unbundled SOG counts as `.sog`."""
+    """Returns which of SUFFIXES a name has; empty if none. The META of an unbundled SOG counts as `.sog`."""
     name = path.name.lower()
     if name == META:
         return ".sog"
@@ -31,12 +31,12 @@ def suffix_of(path: Path) -> str:
 
 
 def splat_file_at(path: Path) -> Path:
-    """Return the META of a folder that holds an unbundled SOG; any other path as it is."""
+    """Returns the META of a folder that holds an unbundled SOG; any other path as it is."""
     return path / META if is_sog_folder(path) else path
 
 
 def is_sog_folder(path: Path) -> bool:
-    """Return whether a folder holds the META of an unbundled SOG; a run folder never does."""
+    """Returns whether a folder holds the META of an unbundled SOG; a run folder never does."""
     meta = path / META
     if not path.is_dir() or not meta.is_file() or (path / "config.yaml").exists():
         return False
@@ -47,7 +47,7 @@ def is_sog_folder(path: Path) -> bool:
 
 
 def refuse_suffix(path: Path, others: tuple[str, ...] = ()) -> None:
-    """Raise InputError if the name promises a format that gsx does not write; `others`: what it writes apart from
+    """Raises InputError if the name promises a format that gsx does not write; `others`: what it writes apart from
     splat files."""
     if path.name.lower() == META or suffix_of(path) not in WRITTEN:
         better = path.parent / f"{path.stem or 'model'}{STANDARD}"

@@ -13,11 +13,7 @@ PIECE = 1 << 20
 
 
 def zstd_module() -> Any:
-    """Return the module that there is.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Returns the module that there is."""
     for name in ("compression.zstd", "zstandard"):
         try:
             return import_module(name)
@@ -27,11 +23,7 @@ def zstd_module() -> Any:
 
 
 def compress(data: bytes) -> bytes:
-    """Return one frame.
-
-    Raises:
-        InputError: there is no Zstandard here.
-    """
+    """Returns one frame."""
     module = zstd_module()
     if hasattr(module, "ZstdFile"):
         return bytes(module.compress(data, level=LEVEL))
@@ -39,11 +31,7 @@ def compress(data: bytes) -> bytes:
 
 
 def decompress(data: bytes, size: int) -> bytes:
-    """Return the `size` bytes of a stream.
-
-    Raises:
-        InputError: it is damaged or has another size, or there is no Zstandard here.
-    """
+    """Returns the `size` bytes of a stream."""
     module = zstd_module()
     try:
         with opened(module, data) as stream:
@@ -59,7 +47,7 @@ def decompress(data: bytes, size: int) -> bytes:
 
 
 def opened(module: Any, data: bytes) -> Any:
-    """Return a file object that decompresses."""
+    """Returns a file object that decompresses."""
     if hasattr(module, "ZstdFile"):
         return module.ZstdFile(BytesIO(data))
     return module.ZstdDecompressor().stream_reader(data)

@@ -57,11 +57,7 @@ class Called:
         return {}
 
     def function(self) -> Callable[..., Tensor]:
-        """The function.
-
-        Raises:
-            ConfigError: it cannot be imported.
-        """
+        """The function."""
         module, colon, name = self.options.function.partition(":")
         try:
             with beside_the_user():

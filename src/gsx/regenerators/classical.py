@@ -61,7 +61,7 @@ class Unchanged:
 
 
 def refuse_enlarging(name: str, scales: Sequence[int]) -> None:
-    """Raise ConfigError if a restorer is asked to enlarge."""
+    """Raises ConfigError if a restorer is asked to enlarge."""
     if max(scales) > 1:
         raise ConfigError(
             f"regenerator {name} cannot enlarge x{max(scales)}: choose another for that role, or augmenter scales=[1]"

@@ -109,7 +109,7 @@ class SceneRestorer:
             )
 
     def prepare(self, context: RegeneratorContext) -> dict[str, float]:
-        """Train each network on held-out renders of half of the views, and measure it on those of the other half.
+        """Trains each network on held-out renders of half of the views, and measure it on those of the other half.
 
         One that has become worse there goes back to what it was. One that brings renders of views it has not seen no
         closer to their photographs is not used.
@@ -156,7 +156,7 @@ class SceneRestorer:
         return (image + request.strength / request.strongest * network(image[None])[0]).clamp(0, 1)
 
     def keep(self, context: RegeneratorContext) -> None:
-        """Write both networks into the run's folder, as one file for each event at which they have learnt."""
+        """Writes both networks into the run's folder, as one file for each event at which they have learnt."""
         from safetensors.torch import save
 
         tensors = {
@@ -173,11 +173,7 @@ class SceneRestorer:
         return [path for path in files if event_of(path) < context.step]
 
     def recalled(self, context: RegeneratorContext, earlier: Sequence[Path]) -> tuple[list[Residual], list[bool]]:
-        """(networks, whether each is of use) as the run had them after its last event before this one, or new ones.
-
-        Raises:
-            InputError: they were of another size.
-        """
+        """(networks, whether each is of use) as the run had them after its last event before this one, or new ones."""
         networks = [
             Residual(self.options.channels, generator).to(context.device)
             for generator in (torch.Generator().manual_seed(derived_seed(context.seed, fold)) for fold in range(FOLDS))

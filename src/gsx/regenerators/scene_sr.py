@@ -221,7 +221,7 @@ def kept_at(
 
 
 def write_network(path: Path, network: nn.Module) -> None:
-    """Keep a network; a cache that cannot be written is no error."""
+    """Keeps a network; a cache that cannot be written is no error."""
     from safetensors.torch import save
 
     try:

@@ -68,7 +68,7 @@ def adopted(shared: Path, own: Path) -> bool:
 
 
 def share(own: Path, shared: Path) -> None:
-    """Let later runs have the adapter; a cache that cannot be written is no error."""
+    """Lets later runs have the adapter; a cache that cannot be written is no error."""
     try:
         copy_adapter(own, make_folder(shared))
         enlist(shared / FACTS)  # which have the digest of the weights
@@ -84,11 +84,7 @@ def copy_adapter(source: Path, target: Path) -> None:
 
 
 def read_facts(folder: Path) -> dict[str, Any]:
-    """What is known of the adapter in a folder.
-
-    Raises:
-        TrainingError: it is damaged.
-    """
+    """What is known of the adapter in a folder."""
     try:
         facts: dict[str, Any] = json.loads((folder / FACTS).read_text(encoding="utf-8"))
         if hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest() == facts["sha256"]:
@@ -100,7 +96,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
 
 
 def merge(pipe: Any, folder: Path) -> None:
-    """Add an adapter to the weights of a model."""
+    """Adds an adapter to the weights of a model."""
     pipe.load_lora_weights(folder, weight_name=WEIGHTS, local_files_only=True)
     pipe.fuse_lora()
     pipe.unload_lora_weights()

@@ -24,11 +24,7 @@ class CascadeOptions:
 
 
 def rungs(scale: int) -> list[int]:
-    """Factors whose product is the scale, the larger first (the paper: x8 is x4, then x2); x1 has none.
-
-    Raises:
-        ConfigError: it is no power of two.
-    """
+    """Factors whose product is the scale, the larger first (the paper: x8 is x4, then x2); x1 has none."""
     power = scale.bit_length() - 1
     if scale != 1 << power:
         raise ConfigError(f"regenerator sd_by_scale enlarges x2, x4, x8, not x{scale}: change the augmenter's scales")
@@ -52,7 +48,7 @@ class Cascade:
             self.models[factor].check(views, [factor], moved)
 
     def prepare(self, context: RegeneratorContext) -> dict[str, float]:
-        """Open them."""
+        """Opens them."""
         return {
             f"x{factor}_{name}": value
             for factor in sorted(self.needed)

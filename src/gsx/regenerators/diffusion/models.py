@@ -87,11 +87,7 @@ def remedy(options: DiffusionOptions, spec: ModelSpec) -> str:
 
 
 def inspect(folder: Path, options: DiffusionOptions, spec: ModelSpec) -> None:
-    """Whether a folder holds what the spec needs, as far as can be told without reading the weights.
-
-    Raises:
-        InputError: something is missing, of another architecture, or cut short.
-    """
+    """Whether a folder holds what the spec needs, as far as can be told without reading the weights."""
     pipeline = class_named(folder, options, spec)
     if spec.accepted and pipeline not in spec.accepted:
         raise InputError(
@@ -141,7 +137,7 @@ def all_weights(folder: Path, options: DiffusionOptions) -> list[Path]:
 
 
 def refuse_damaged(path: Path, options: DiffusionOptions) -> None:
-    """Raise InputError if a file's header does not fit its length."""
+    """Raises InputError if a file's header does not fit its length."""
     from safetensors import SafetensorError, safe_open
 
     try:

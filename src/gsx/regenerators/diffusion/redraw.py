@@ -86,7 +86,7 @@ class Diffusion:
         self.folder = located(self.options, self.spec)
 
     def prepare(self, context: RegeneratorContext) -> dict[str, float]:
-        """Open the pipeline, and tune it to the scene if it is to be; once per run.
+        """Opens the pipeline, and tune it to the scene if it is to be; once per run.
 
         Raises:
             TrainingError: it cannot be loaded or does not fit into memory; the run keeps its checkpoint.
@@ -155,11 +155,7 @@ class Diffusion:
         return results
 
     def called(self, batch: Batch) -> Float[Tensor, "B 3 H W"]:
-        """Results of one call, in halves where memory does not suffice.
-
-        Raises:
-            TrainingError: a single picture does not fit, or the pipeline fails; the run keeps its checkpoint.
-        """
+        """Results of one call, in halves where memory does not suffice."""
         try:
             return self.of_the_right_size(batch, self.spec.call(self.pipe, batch, self.options).detach().cpu().float())
         except Exception as error:  # whatever a library or a custom pipeline raises, the run must end in one sentence
@@ -196,11 +192,7 @@ def any_pipeline(options: PipelineOptions) -> Diffusion:
 
 
 def rounds_to(scale: int, spec: ModelSpec, options: DiffusionOptions) -> int:
-    """How often a model is applied to reach a scale.
-
-    Raises:
-        ConfigError: it never gets there.
-    """
+    """How often a model is applied to reach a scale."""
     if spec.factor == 1:
         refuse_enlarging(options.name, [scale])
         return 1

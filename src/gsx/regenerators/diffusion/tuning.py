@@ -77,7 +77,7 @@ class Pairs:
 
 
 def tuned(pipe: Any, options: RestorerOptions, spec: ModelSpec, context: RegeneratorContext, files: str) -> Tuned:
-    """Merge the adapter of this scene into a model: the run's own, one from the cache, or a new one.
+    """Merges the adapter of this scene into a model: the run's own, one from the cache, or a new one.
 
     It must bring held-out renders closer to their photographs than the model as it was does, and than they are.
 
@@ -102,7 +102,7 @@ def tuned(pipe: Any, options: RestorerOptions, spec: ModelSpec, context: Regener
 
 
 def refuse_another(facts: dict[str, Any], folder: Path, options: RestorerOptions, files: str) -> None:
-    """Raise TrainingError if an adapter was learnt for another model, or otherwise."""
+    """Raises TrainingError if an adapter was learnt for another model, or otherwise."""
     if facts.get("model_sha256") != files or facts.get("tuning") != asdict(options.tuning):
         raise TrainingError(
             f"the adapter in {folder} was learnt with other files of the model, or other tuning options: go on with "
@@ -134,7 +134,7 @@ def new_adapter(
     files: str,
     folder: Path,
 ) -> bool:
-    """Learn from most of the pairs, measure on the others before and after, and write what came of it into a folder.
+    """Learns from most of the pairs, measure on the others before and after, and write what came of it into a folder.
 
     Returns whether all steps were taken.
     """
@@ -235,7 +235,7 @@ def cropped(
 def learn(
     pipe: Any, options: RestorerOptions, spec: ModelSpec, pairs: Sequence[Pair], context: RegeneratorContext
 ) -> bool:
-    """Give the model an adapter and train it; whether all steps were taken."""
+    """Gives the model an adapter and train it; whether all steps were taken."""
     generator, tuning = torch.Generator().manual_seed(context.seed), options.tuning
     adapted = add_adapter(pipe, tuning, context.seed)
     optimiser = torch.optim.AdamW(adapted, lr=tuning.rate, weight_decay=WEIGHT_DECAY)
@@ -271,11 +271,7 @@ def rate_at(step: int, tuning: TuningOptions) -> float:
 
 
 def noise_steps(pipe: Any, options: RestorerOptions) -> tuple[int, int]:
-    """First and last step of the noise schedule at which image-to-image begins with the strengths of the run.
-
-    Raises:
-        ValueError: the model does not predict noise.
-    """
+    """First and last step of the noise schedule at which image-to-image begins with the strengths of the run."""
     schedule = pipe.scheduler
     if schedule.config.prediction_type != "epsilon":
         raise ValueError(f"the model predicts {schedule.config.prediction_type}; only epsilon can be tuned")
