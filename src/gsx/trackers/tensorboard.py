@@ -1,4 +1,4 @@
-"""TensorBoard: the lines of metrics.jsonl as curves, figures of the evaluation, test pictures and the configuration."""
+"""TensorBoard: lines of metrics.jsonl as curves, figures of the evaluation, test pictures and the configuration."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,9 +19,9 @@ class TensorBoardOptions:
 
     name: str
     folder: str
-    """Where runs are written, each to a folder of its own; empty: `tensorboard` in the run folder."""
+    """Folder with one inside for each run; empty: `tensorboard` in the run folder."""
     pictures: Annotated[int, Range(0, 10**6)]
-    """Test views that are shown beside their truth when the run is evaluated."""
+    """Test views, each with its truth, that are written when the run is evaluated."""
 
 
 class TensorBoard:
@@ -39,30 +39,30 @@ class TensorBoard:
 
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
-        """Open an event file; one that goes on hides what earlier ones hold after the checkpoint."""
+        """Opens an event file that hides what earlier ones hold after the checkpoint."""
         from torch.utils.tensorboard import SummaryWriter
 
         folder = events_folder(run, self.options.folder)
-        begun = any(folder.glob("events.out.tfevents.*"))
-        self.writer = SummaryWriter(str(folder), purge_step=run.step + 1 if begun else None)
-        self.sent = len(run.curves) if begun else 0
+        resumed = any(folder.glob("events.out.tfevents.*"))
+        self.writer = SummaryWriter(str(folder), purge_step=run.step + 1 if resumed else None)
+        self.sent = len(run.curves) if resumed else 0
         self.writer.add_text("config", indented((run.folder / "config.yaml").read_text(encoding="utf-8")), run.step)
         self.send(run)
 
     @hookimpl
     def gsx_step_finished(self, run: Run) -> None:
-        """Write what metrics.jsonl has got."""
+        """Writes new lines."""
         self.send(run)
 
     @hookimpl
     def gsx_training_finished(self, run: Run) -> None:
-        """Close the file of a run that was interrupted."""
+        """Closes the file of an interrupted run."""
         if not run.complete:
             self.writer.close()
 
     @hookimpl
     def gsx_evaluated(self, run: Run, evaluation: dict[str, Any]) -> None:
-        """Write figures and pictures."""
+        """Writes figures and pictures."""
         for tag, value in evaluation_figures(evaluation).items():
             self.writer.add_scalar(tag, value, evaluation["step"])
         for tag, path in pictures(run.folder / "renders", self.options.pictures).items():
@@ -70,17 +70,17 @@ class TensorBoard:
 
     @hookimpl
     def gsx_run_finished(self) -> None:
-        """Close the file."""
+        """Closes the file."""
         self.writer.close()
 
     @hookimpl
     def gsx_run_failed(self, run: Run, reason: str) -> None:
-        """Say why, and close the file."""
+        """Writes the reason and closes the file."""
         self.writer.add_text("failed", indented(reason), run.step)
         self.writer.close()
 
     def send(self, run: Run) -> None:
-        """Write new lines, and onto the disk at once: what a checkpoint covers must be there when a run goes on."""
+        """Writes new lines to the disk at once: what a checkpoint covers must be there when a run goes on."""
         lines = run.curves[self.sent :]
         for line in lines:
             for tag, value in line_figures(line).items():
@@ -91,15 +91,15 @@ class TensorBoard:
 
 
 def events_folder(run: Run, folder: str) -> Path:
-    """Where a run's event files go; below `folder` it lies as it does below `output`."""
+    """Returns the folder of a run's event files; its path below `folder` is that below `output`."""
     if not folder:
         return run.folder / "tensorboard"
-    own, output = run.folder.resolve(), Path(run.config["output"]).resolve()
-    return at_home(folder) / (own.relative_to(output) if own.is_relative_to(output) else own.name)
+    place, output = run.folder.resolve(), Path(run.config["output"]).resolve()
+    return at_home(folder) / (place.relative_to(output) if place.is_relative_to(output) else place.name)
 
 
 def pictures(renders: Path, count: int) -> dict[str, Path]:
-    """Pictures of the first `count` test views that were drawn, by tag."""
+    """Finds the pictures of the first `count` drawn test views, by tag."""
     views = read_json(renders / "index.json")["views"][:count]
     return {
         f"{view['name']}/{kind}": renders / Path(view["files"][kind]).name
@@ -109,5 +109,5 @@ def pictures(renders: Path, count: int) -> dict[str, Path]:
 
 
 def indented(text: str) -> str:
-    """Text that Markdown leaves as it is."""
+    """Indents a text so that Markdown leaves it as it is."""
     return "".join(f"    {line}\n" for line in text.splitlines())

@@ -13,7 +13,8 @@ from tiny import words
 
 from gsx.cli.dispatch import main
 from gsx.core.files import own_mark
-from gsx.experiments.run_folder.files import has_figures, is_number, read_run, sound_line, state_of
+from gsx.experiments.run_folder.files import has_figures, read_run, state_of
+from gsx.experiments.run_folder.shapes import LINE, fits, is_number
 
 OLD = Path(__file__).parents[2] / "old_run"
 QUICK = ("iterations=2", "training.log_every=1", "training.checkpoint_every=1", "rasterizer=eager")
@@ -75,27 +76,27 @@ def test_a_run_without_any_checkpoint_says_which_is_missing_and_that_nothing_bri
 
 
 @pytest.mark.parametrize(
-    ("name", "length", "told"),
+    ("name", "length", "problem"),
     [
         ("point_cloud.ply", 0, "no complete PLY header"),
         ("point_cloud.ply", 1000, "no complete PLY header"),
-        ("point_cloud.ply", -1, "bytes, its header tells"),
+        ("point_cloud.ply", -1, "bytes, its header says"),
         ("renders/index.json", 1, "renders/index.json cannot be read"),
         ("environment.json", 1, "environment.json cannot be read"),
         ("status.json", 1, "status.json cannot be read"),
         ("metrics.jsonl", 0, "metrics.jsonl holds no line of the run"),
         (f"{CHECKPOINT}.safetensors", 0, "step_0000002.safetensors cannot be read"),
         (f"{CHECKPOINT}.safetensors", 4, "step_0000002.safetensors cannot be read"),
-        (f"{CHECKPOINT}.safetensors", -1, "bytes, its head tells"),
+        (f"{CHECKPOINT}.safetensors", -1, "file not fully covered"),
         (f"{CHECKPOINT}.json", 1, "step_0000002.safetensors cannot be read"),
     ],
 )
-def test_a_run_with_a_file_cut_short_is_corrupted(run: Path, name: str, length: int, told: str) -> None:
+def test_a_run_with_a_file_cut_short_is_corrupted(run: Path, name: str, length: int, problem: str) -> None:
     content = (run / name).read_bytes()
     (run / name).write_bytes(content[:length])
     state, reason = state_of(read_run(run))
     assert state == "corrupted"
-    assert told in reason
+    assert problem in reason
 
 
 def test_a_run_of_an_older_gsx_says_in_a_sentence_what_it_lacks() -> None:
@@ -197,7 +198,7 @@ ACCOUNT = {"event": 1, "asked": {"2": 4}, "dropped": {}, "warned": {"agreement":
     ],
 )
 def test_lines_that_a_run_cannot_reckon_with_are_damaged(line: object, sound: bool) -> None:
-    assert sound_line(line) is sound
+    assert fits(line, LINE) is sound
 
 
 def test_a_run_with_odd_lines_goes_on(run: Path) -> None:

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gsx.core.options import flattened
-from gsx.experiments.run_folder.files import RunFiles, is_number, part
+from gsx.experiments.run_folder.files import RunFiles, part
 from gsx.experiments.run_folder.run_key import EVALUATION, NAMES, WHERE
+from gsx.experiments.run_folder.shapes import is_number
 
 BESIDE = (*WHERE, *NAMES, *EVALUATION, "augmenter", "regenerator", "seed")
 """Keys in which a run may differ from its baseline, and runs of one comparison from each other (the seed)."""

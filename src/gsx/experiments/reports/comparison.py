@@ -10,7 +10,8 @@ from markupsafe import Markup
 from gsx.experiments.evaluation.remarks import measures_nothing
 from gsx.experiments.reports.charts import STYLES, Dot, Series, line_chart, pareto_front, scatter, style
 from gsx.experiments.reports.page import duration, fixed, time_unit
-from gsx.experiments.run_folder.files import RunFiles, is_number, part
+from gsx.experiments.run_folder.files import RunFiles, part
+from gsx.experiments.run_folder.shapes import is_number
 
 COSTS = (("primitives", "primitives", 0), ("megabytes", "MB", 1), ("seconds", "seconds of training", 1))
 """What quality is plotted against: column, its name on the axis, decimals."""

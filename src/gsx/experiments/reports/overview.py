@@ -23,13 +23,13 @@ from gsx.experiments.run_folder.files import (
     RunFiles,
     detail_share,
     gain_of,
-    is_number,
     part,
     read_run,
     runs_below,
     state_of,
 )
 from gsx.experiments.run_folder.run_key import comparable
+from gsx.experiments.run_folder.shapes import is_number
 
 DIFFERENCES = 6
 """Configuration keys in which runs differ that an overview shows."""

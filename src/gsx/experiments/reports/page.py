@@ -9,7 +9,7 @@ from urllib.parse import quote
 import jinja2
 
 from gsx.experiments.reports.charts import compact
-from gsx.experiments.run_folder.files import is_number
+from gsx.experiments.run_folder.shapes import is_number
 
 NONE = "n/a"
 

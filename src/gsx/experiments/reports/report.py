@@ -24,12 +24,12 @@ from gsx.experiments.run_folder.files import (
     RunFiles,
     detail_share,
     gain_of,
-    is_number,
     part,
     read_run,
     state_of,
 )
 from gsx.experiments.run_folder.heads import newest_checkpoint
+from gsx.experiments.run_folder.shapes import is_number
 
 __all__ = ["report_on", "write_overview", "write_report"]
 

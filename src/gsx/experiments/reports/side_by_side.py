@@ -12,7 +12,8 @@ from typing import Any
 
 from gsx.core.errors import command
 from gsx.experiments.reports.comparison import Entry, Group
-from gsx.experiments.run_folder.files import RunFiles, gain_of, is_number, part
+from gsx.experiments.run_folder.files import RunFiles, gain_of, part
+from gsx.experiments.run_folder.shapes import is_number
 
 PNG, JPEG = (b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"), (b"\xff\xd8\xff", b"\xff\xd9")
 """How whole files begin and end."""

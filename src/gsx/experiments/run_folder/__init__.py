@@ -1,1 +1,1 @@
-"""What a run folder holds, and the key that names a run by what it trains."""
+"""Content of run folders, and the key that names a run by what it trains."""

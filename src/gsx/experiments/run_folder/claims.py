@@ -1,10 +1,9 @@
-"""One process at a time trains in a run folder or evaluates it: a lock in it, which says who holds it."""
+"""Claims of run folders: one process at a time trains or evaluates there; a lock file says which."""
 
 import json
 import logging
 import os
 import platform
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -18,19 +17,19 @@ from gsx.core.errors import InputError
 logger = logging.getLogger(__name__)
 
 LOCK = ".lock"
-"""Of a run folder in which somebody works."""
+"""Lock file in a run folder."""
 TRIES = 20
-"""Times that a lock file is opened which its holder removes meanwhile."""
+"""Attempts to open a lock file that its holder removes meanwhile."""
 
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """This process alone works in a folder as long as the context lasts; the claim of a killed one is void.
+    """Claims a folder for this process; the claim of a killed process is void.
 
-    On a file system without locks nobody can know, which is told.
+    A file system without locks is only warned of.
 
     Raises:
-        InputError: another process does, which is named.
+        InputError: another process has claimed it.
     """
     with held(folder / LOCK, folder):
         yield
@@ -38,10 +37,10 @@ def claimed(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def claimed_name(folder: Path) -> Iterator[None]:
-    """The same of a folder that others find by its name and that may have to be made or moved away: a lock beside it.
+    """Claims a folder that may have to be made or moved away, by a lock beside it.
 
     Raises:
-        InputError: another process does, which is named; or nobody can know.
+        InputError: another process has claimed it, or the file system has no locks.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     with held(folder.parent / f".{folder.name}{LOCK}", folder, needed=True):
@@ -49,16 +48,17 @@ def claimed_name(folder: Path) -> Iterator[None]:
 
 
 def left_behind(folder: Path) -> bool:
-    """Whether there is a claim on a folder or its name: somebody is at work, or was killed there."""
+    """Tells whether there is a lock file of a folder: a process works in it, or was killed there."""
     return (folder / LOCK).exists() or (folder.parent / f".{folder.name}{LOCK}").exists()
 
 
 @contextmanager
 def held(path: Path, folder: Path, needed: bool = False) -> Iterator[None]:
-    """A lock file that says who works in the folder."""
-    with taken(path, folder, needed) as stream:
+    """Holds a lock file that says who works in the folder, and removes it at the end."""
+    with locked(path, folder, needed) as stream:
         stream.truncate(0)
-        json.dump({"host": platform.node(), "process": os.getpid(), "since": now()}, stream)
+        since = datetime.now().isoformat(sep=" ", timespec="seconds")
+        json.dump({"host": platform.node(), "process": os.getpid(), "since": since}, stream)
         stream.flush()
         try:
             yield
@@ -67,25 +67,20 @@ def held(path: Path, folder: Path, needed: bool = False) -> Iterator[None]:
                 path.unlink()
 
 
-def now() -> str:
-    """Local time to the second."""
-    return datetime.now().isoformat(sep=" ", timespec="seconds")
-
-
-def taken(path: Path, folder: Path, needed: bool) -> IO[str]:
-    """The lock file, open and locked. One that its last holder removed meanwhile is opened again.
+def locked(path: Path, folder: Path, needed: bool) -> IO[str]:
+    """Opens and locks the lock file; opens it again if its last holder removed it meanwhile.
 
     Raises:
-        InputError: another process has it, it cannot be opened, or its file system knows no locks and they are needed.
+        InputError: another process has it, it cannot be opened, or locks are `needed` and the file system has none.
     """
+    problem = "lock files vanish"
     for _ in range(TRIES):
         stream = opened(path, folder)
         try:
             if not lock_descriptor(stream.fileno(), blocking=False):
                 raise InputError(f"{folder} is in use by {holder(stream)}: wait for it, or stop it")
-            if same_file(stream, path):
+            if is_at(path, stream):
                 return stream
-            problem = "its lock files do not stay"
         except OSError as error:
             problem = error.strerror or str(error)
         except BaseException:
@@ -94,56 +89,39 @@ def taken(path: Path, folder: Path, needed: bool) -> IO[str]:
         stream.close()
     if needed:
         raise InputError(
-            f"{folder.parent} lies on a file system without locks ({problem}), which keep processes from training the "
-            "same run: choose another place, output=FOLDER"
+            f"{folder.parent} is on a file system without locks ({problem}), so two processes could train the same "
+            "run: choose another place, output=FOLDER"
         )
-    logger.warning("%s lies on a file system without locks: see that no other process trains in it", folder)
+    logger.warning("%s is on a file system without locks: check that no other process trains in it", folder)
     return opened(path, folder)
 
 
 def opened(path: Path, folder: Path) -> IO[str]:
-    """The lock file, made where there is none; what it holds stays, and a link is not followed.
+    """Opens the lock file with its content, or makes it; follows no link.
 
     Raises:
         InputError: it cannot be opened.
     """
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
-    known = f"{path}, by which processes know of each other,"
     try:
-        number = os.open(path, flags, 0o666)
-    except PermissionError as error:
-        if mine(folder) and not (os.access(folder, os.X_OK) and path.exists()):
-            raise InputError(f"{folder} cannot be written to ({error.strerror}): chmod u+wx {folder}") from error
-        raise InputError(
-            f"{known} is {owner(path)}'s: have them take it away, or share {folder} with you (chmod g+w)"
-        ) from error
+        return os.fdopen(os.open(path, flags, 0o666), "r+", encoding="utf-8")
     except OSError as error:
         raise InputError(
-            f"{known} cannot be opened ({error.strerror}): it must be writable and no link; see who trains in {folder} "
-            "before you remove it"
+            f"lock file {path} of {owner(path)} cannot be opened ({error.strerror}): make it and {folder} writable "
+            f"(chmod u+rwx {folder}, or g+rw by its owner), or remove it if it is a link"
         ) from error
-    found = os.fstat(number)
-    if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:  # its content would be lost
-        os.close(number)
-        raise InputError(f"{known} is no file of its own, but a link, pipe or device: remove it")
-    return os.fdopen(number, "r+", encoding="utf-8")
-
-
-def mine(path: Path) -> bool:
-    """Whether it belongs to who runs this."""
-    return os.name == "posix" and path.stat().st_uid == os.geteuid()
 
 
 def owner(path: Path) -> str:
-    """The user whose file it is, in words; of a file in a folder that cannot be written to, the folder's."""
+    """Names the user whose file or folder it is."""
     try:
         return (path if path.exists() else path.parent).owner()
     except (OSError, KeyError, NotImplementedError):
         return "another user"
 
 
-def same_file(stream: IO[str], path: Path) -> bool:
-    """Whether an open file is the one that its path still names."""
+def is_at(path: Path, stream: IO[str]) -> bool:
+    """Tells whether an open file is the one at a path."""
     try:
         return os.path.samestat(os.fstat(stream.fileno()), path.stat())
     except FileNotFoundError:
@@ -151,10 +129,10 @@ def same_file(stream: IO[str], path: Path) -> bool:
 
 
 def holder(stream: IO[str]) -> str:
-    """Who has a lock file, in words."""
+    """Describes the holder of a lock file."""
     try:
         stream.seek(0)
-        told = json.load(stream)
-        return f"process {told['process']} on {told['host']} since {told['since']}"
+        content = json.load(stream)
+        return f"process {content['process']} on {content['host']} since {content['since']}"
     except (OSError, ValueError, TypeError, KeyError):  # Windows does not let others read it
         return "another process"

@@ -14,7 +14,7 @@ BEGINNINGS = ("scratch", "warm_start")
 
 
 def splat_file(init: Any) -> Path | None:
-    """The splat file that a value of `init` names; None: it names none."""
+    """Returns the splat file that a value of `init` names; None: it names none."""
     return None if init is None or init in BEGINNINGS else Path(str(init))
 
 
@@ -29,31 +29,30 @@ class GeneralOptions:
     output: str = without_effect()
     folder: str = without_effect()
     length: Steps = label(default=0)
-    """Iterations of the whole run, of which a budget takes a share: the variant's, the scene's or the backbone's."""
+    """Iterations before a budget takes its share."""
     variant: str = label(default="")
     """Name of the published method that is composed; empty for others."""
     data_root: str = without_effect(default="")
     """Where datasets lie."""
     reuse: bool = without_effect(default=False)
-    """The run's folder is named by its composition; what is finished there is not trained again (`run_key`)."""
+    """Names the run's folder by its composition and trains nothing again that is finished there (`run_key`)."""
     init: str = without_effect(default="scratch")
-    """scratch; warm_start: branch from an earlier run that differs in its augmenters alone (`warm_start`); or a splat
-    file that Gaussians go on from, which does count for what is trained (`run_key`)."""
+    """scratch; warm_start: branch from an earlier run; or a splat file to go on from, which counts in `run_key`."""
     axes: str = without_effect(default=AUTO)
-    """Axes of the splat file of `init`: auto, or three letters; given ones count for what is trained (`run_key`)."""
+    """Axes of the splat file of `init`: auto, or three letters, which count in `run_key`."""
     warm_start_at: Annotated[list[int], Range(1, MOST_STEPS)] = without_effect(default_factory=list)
-    """Steps at which states are kept for other runs; none given: where the paper's variants begin."""
+    """Steps at which states are kept for other runs; empty: where the paper's variants begin."""
     disk_cache_gb: Gigabytes = without_effect(default=20.0)
-    """For what runs share: states, reconstructions, undistorted and redrawn pictures, networks."""
+    """Size of the cache that runs share: states, reconstructions, pictures, networks."""
 
     viewer: bool = without_effect(default=False)
-    """The model is shown in a browser while it is trained."""
+    """Shows the model in a browser during training."""
     viewer_host: str = without_effect(default="127.0.0.1")
-    """Address at which the viewer listens: this machine alone."""
+    """Address at which the viewer listens."""
     viewer_port: Annotated[int, Range(0, 65535)] = without_effect(default=8080)
-    """0: any that is free."""
+    """0: any free port."""
     viewer_share: Share = without_effect(default=0.25)
-    """Of the time of training, that pictures for the viewer may take."""
+    """Share of the time for the viewer's pictures."""
 
     def __post_init__(self) -> None:
         file = splat_file(self.init)

@@ -22,8 +22,9 @@ from gsx.engine.cache import source_revision
 from gsx.engine.collector import gc_paused
 from gsx.experiments.evaluation.lpips import load_lpips
 from gsx.experiments.run_folder.claims import LOCK, claimed
-from gsx.experiments.run_folder.files import RunFiles, is_number, read_run
+from gsx.experiments.run_folder.files import RunFiles, read_run
 from gsx.experiments.run_folder.run_key import composition_key, finished, other_revision, place_of, trained_on
+from gsx.experiments.run_folder.shapes import is_number
 from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.build import build, choose_device, prepare_compiling, refuse_uneven
 from gsx.experiments.runs.environment import environment

@@ -15,12 +15,12 @@ from gsx.experiments.run_folder.files import (
     detail_share,
     gain_of,
     has_figures,
-    is_number,
     part,
     read_run,
     state_of,
 )
-from gsx.experiments.run_folder.run_key import NAMES, WHERE, asked_for, comparable, other_revision, without
+from gsx.experiments.run_folder.run_key import NAMES, WHERE, comparable, other_revision, used_regenerators, without
+from gsx.experiments.run_folder.shapes import is_number
 from gsx.experiments.runs.warm_start import BRANCH
 from gsx.experiments.tables.plan import Cell, Experiment
 from gsx.experiments.tables.published import Published
@@ -415,7 +415,7 @@ def protocol_settings(config: dict[str, Any], idle: frozenset[str]) -> dict[str,
     kept["dataset"] = part(known, "dataset").get("title")
     kept["eval"] = without(part(known, "eval"), ("zoom", "tile_pixels"))
     kept["metrics"] = {key: part(part(known, "metrics"), "lpips").get(key) for key in ("net", "input_range")}
-    return kept | {"regenerator": placeless(asked_for(known))}
+    return kept | {"regenerator": placeless(used_regenerators(known))}
 
 
 def placeless(node: Any) -> Any:

@@ -21,7 +21,7 @@ from gsx.core.data.camera import Camera, pinhole
 from gsx.core.errors import InputError
 from gsx.core.files import read_json, write_json
 from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
-from gsx.experiments.run_folder.files import is_number
+from gsx.experiments.run_folder.shapes import is_number
 
 OWN = "gsx_camera_path"
 MOST_FRAMES = 100_000
