@@ -1,7 +1,7 @@
-"""Detail above the Nyquist frequency of the training pictures: how much a zoomed picture has of it, or invents.
+"""Detail above the Nyquist frequency of the training pictures: how much of it a zoomed picture has, or invents.
 
-PSNR at x4 is ruled by what the picture at x1 already holds. An orthonormal DCT-II of the difference and of the truth
-splits both at the frequency that the training pictures end at, 1/2 cycle per training px.
+PSNR at x4 depends mostly on what the picture at x1 already holds. An orthonormal DCT-II of the difference and of the
+truth splits both at the frequency where the training pictures end, 1/2 cycle per training px.
 """
 
 import math
@@ -18,7 +18,7 @@ from gsx.core.shapes import Float
 BORDER_PIXELS, BORDER_SHARE = 8, 0.02
 """Left out along each border: so many training px, or this share of the side if that is more."""
 RECOVERABLE = 1.5
-"""Reduced photographs hold something up to this many times their Nyquist frequency (3/4 cycle per training px)."""
+"""Reduced photos hold something up to this many times their Nyquist frequency (3/4 cycle per training px)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,7 @@ class Detail:
     high: float
     """Above it; both add up to the MSE of the window."""
     recoverable: float
-    """Of `high` up to RECOVERABLE times that frequency."""
+    """Part of `high` up to RECOVERABLE times that frequency."""
     truth_high: float
     truth_recoverable: float
 
@@ -40,10 +40,9 @@ Details: TypeAlias = dict[str, Detail]
 
 
 def dct(values: Float[Tensor, "*shape N"]) -> Float[Tensor, "*shape N"]:
-    """Orthonormal DCT-II along the last axis, through an FFT of the even and then the odd samples (Makhoul 1980).
+    """Computes the orthonormal DCT-II along the last axis by an FFT of even, then reversed odd samples.
 
-    Of a real signal's spectrum half is enough: turned, its real parts are the first coefficients, its imaginary parts,
-    negative and from behind, the last ones.
+    Source: Makhoul 1980; a real signal's half spectrum has the first coefficients as real, the last as imaginary parts.
     """
     size = values.shape[-1]
     half = torch.fft.rfft(torch.cat([values[..., ::2], values[..., 1::2].flip(-1)], -1))
@@ -55,18 +54,19 @@ def dct(values: Float[Tensor, "*shape N"]) -> Float[Tensor, "*shape N"]:
 
 
 def powers(picture: Float[Tensor, "C H W"], corners: Sequence[tuple[int, int]]) -> list[float]:
-    """Mean square of a picture in each corner of so many lowest frequencies, down and across, over all of its pixels
-    and channels; a channel at a time."""
+    """Returns the mean square over pixels and channels of a picture's lowest (down, across) frequencies per corner."""
     square = picture.new_zeros(picture.shape[2], picture.shape[1])
-    for channel in picture:
+    for channel in picture:  # one at a time, for memory
         square += dct(dct(channel).mT).square_()
-    found = [square[:across, :down].sum(dtype=torch.float64) for down, across in corners]
-    return [float(power) / picture.numel() for power in found]
+    sums = [square[:across, :down].sum(dtype=torch.float64) for down, across in corners]
+    return [float(power) / picture.numel() for power in sums]
 
 
 def details_of(images: Mapping[str, Float[Tensor, "3 H W"]], truth: Float[Tensor, "3 H W"], factor: float) -> Details:
-    """How pictures differ from the truth, `factor` times as fine as training, by name; none where nothing lies within
-    the borders or no frequency above those of training."""
+    """Compares pictures with the truth, `factor` times as fine as training, by name.
+
+    Empty where no pixel lies within the borders or no frequency above those of training.
+    """
     window = interior(truth.shape[1], factor), interior(truth.shape[2], factor)
     exact = truth[:, *window]
     if min(exact.shape[1:]) < 2 or factor <= 1:
@@ -83,28 +83,27 @@ def details_of(images: Mapping[str, Float[Tensor, "3 H W"]], truth: Float[Tensor
 
 
 def by_band(picture: Float[Tensor, "C H W"], corners: Sequence[tuple[int, int]]) -> tuple[float, float, float]:
-    """Mean square of a picture in the first corner, in all but that, and in what the second has beyond it."""
+    """Returns the mean square of a picture in the first corner, outside of it, and in the rest of the second."""
     below, up_to, whole = powers(picture, corners)
     return below, max(0.0, whole - below), max(0.0, up_to - below)
 
 
 def corner(height: int, width: int, factor: float, end: float) -> tuple[int, int]:
-    """How many frequencies down and across lie below so many times the Nyquist frequency of training."""
+    """Counts the frequencies down and across below `end` times the Nyquist frequency of training."""
     rows, columns = (torch.arange(side, dtype=torch.float64) / side * factor for side in (height, width))
     return int((rows < end).sum()), int((columns < end).sum())
 
 
 def interior(size: int, factor: float) -> slice:
-    """Pixels of a side without its borders."""
+    """Returns the pixels of a side without its borders."""
     border = math.ceil(max(BORDER_PIXELS * factor, BORDER_SHARE * size))
     return slice(border, max(border, size - border))
 
 
 def explained(details: Sequence[Detail]) -> dict[str, float]:
-    """Figures over views: PSNR below and above the Nyquist frequency of training, dB, and the explained shares.
+    """Sums up views: PSNR below and above the Nyquist frequency of training, dB, and the explained shares.
 
-    `explained` is 1 - sum of `high` / sum of `truth_high`: 0 without any detail, 1 for the truth, negative for detail
-    that is invented or misplaced. `recoverable` is the same of that band.
+    `explained` is 1 - sum(high) / sum(truth_high): 1 for the truth, 0 without detail, negative for invented detail.
     """
     low, high, band, truth, truth_band = (
         math.fsum(getattr(detail, name) for detail in details)

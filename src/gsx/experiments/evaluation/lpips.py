@@ -1,8 +1,8 @@
 """LPIPS (Zhang et al. 2018, v0.1) with weights from local files; nothing is ever downloaded.
 
 The trunk is torchvision's VGG16 or AlexNet state dict (`vgg16-397923af.pth`, `alexnet-owt-7be5be79.pth`), the head the
-linear layers of the lpips package (`vgg.pth`, `alex.pth`). Published 3D-GS figures feed images in [0, 1] although the
-network expects [-1, 1] (3D-GS, metrics.py): `input_range` selects, and the name of the figure says which.
+linear layers of the lpips package (`vgg.pth`, `alex.pth`). 3D-GS (metrics.py) feeds [0, 1] although the network expects
+[-1, 1]: `input_range` selects.
 """
 
 import logging
@@ -33,7 +33,7 @@ STAGES: dict[str, list[tuple[int, list[Layer]]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class LpipsOptions:
-    """Where the weights are; empty paths: LPIPS is not computed."""
+    """Weights files; empty paths: LPIPS is not computed."""
 
     trunk: str
     head: str
@@ -42,17 +42,17 @@ class LpipsOptions:
 
 
 def stages_of(net: str) -> nn.ModuleList:
-    """Stages whose features are compared; children numbered as in torchvision's `features`."""
-    stages, number, channels = nn.ModuleList(), 0, 3
+    """Builds the stages whose features are compared; children have the numbers of torchvision's `features`."""
+    stages, index, channels = nn.ModuleList(), 0, 3
     for pooling, layers in STAGES[net]:
         stage = nn.Sequential()
         if pooling:
-            stage.add_module(str(number), nn.MaxPool2d(pooling, 2))
-            number += 1
+            stage.add_module(str(index), nn.MaxPool2d(pooling, 2))
+            index += 1
         for width, kernel, stride, padding in layers:
-            stage.add_module(str(number), nn.Conv2d(channels, width, kernel, stride, padding))
-            stage.add_module(str(number + 1), nn.ReLU())
-            number, channels = number + 2, width
+            stage.add_module(str(index), nn.Conv2d(channels, width, kernel, stride, padding))
+            stage.add_module(str(index + 1), nn.ReLU())
+            index, channels = index + 2, width
         stages.append(stage)
     return stages
 
@@ -74,12 +74,12 @@ class Lpips(nn.Module):
 
     @property
     def name(self) -> str:
-        """Names the variant in results."""
+        """Returns the name of the variant in results."""
         return f"lpips_{self.net}, input in {'[-1,1]' if self.signed else '[0,1]'}{self.note}"
 
     @torch.no_grad()
     def distance(self, image: Float[Tensor, "3 H W"], target: Float[Tensor, "3 H W"]) -> float:
-        """LPIPS of two pictures with values in [0, 1]."""
+        """Computes LPIPS of two pictures with values in [0, 1]."""
         pair = torch.stack([image, target]).to(self.heads[0])
         features = (pair * 2 - 1 if self.signed else pair) - pair.new_tensor(SHIFT)[:, None, None]
         features = features / pair.new_tensor(SCALE)[:, None, None]
@@ -91,34 +91,37 @@ class Lpips(nn.Module):
         return total
 
 
-def shapes_of(net: str) -> tuple[dict[str, torch.Size], dict[str, int]]:
-    """Return what net `vgg` or `alex` needs: shapes of the trunk's tensors, lengths of the head's, by name."""
+def shapes_of(net: str) -> dict[str, dict[str, str]]:
+    """Returns the shapes that a net needs, as text, by file and name of the tensor."""
     with torch.device("meta"):
         stages = stages_of(net)
-    trunk = {f"features.{name.partition('.')[2]}": value.shape for name, value in stages.state_dict().items()}
-    return trunk, {f"lin{index}.model.1.weight": layers[-1][0] for index, (_, layers) in enumerate(STAGES[net])}
+    trunk = {f"features.{name.partition('.')[2]}": shape_text(value) for name, value in stages.state_dict().items()}
+    return {"trunk": trunk, "head": {head_name(i): str(layers[-1][0]) for i, (_, layers) in enumerate(STAGES[net])}}
+
+
+def head_name(stage: int) -> str:
+    """Names the tensor of a stage in the head's file."""
+    return f"lin{stage}.model.1.weight"
+
+
+def shape_text(value: Tensor) -> str:
+    """Formats a shape without its ones, since heads differ in these."""
+    return "x".join(str(size) for size in value.shape if size > 1)
 
 
 def misfit(trunk: Mapping[str, Tensor], head: Mapping[str, Tensor], net: str) -> str:
-    """Return what is wrong with the two files for a net, in words; empty if both fit."""
-    shapes, lengths = shapes_of(net)
-    for file, weights, needed in (("trunk", trunk, shapes), ("head", head, lengths)):
-        for name, size in needed.items():
+    """Describes what is wrong with two files for a net; empty: both fit."""
+    for (file, needed), weights in zip(shapes_of(net).items(), (trunk, head), strict=True):
+        for name, shape in needed.items():
             if name not in weights:
                 return f"the {file} file lacks finite '{name}'"
-            found = weights[name].shape if file == "trunk" else weights[name].numel()
-            if found != size:
-                return f"'{name}' of the {file} file has {words_of(found)} instead of {words_of(size)} numbers"
+            if shape_text(weights[name]) != shape:
+                return f"'{name}' of the {file} file has {shape_text(weights[name])} instead of {shape} numbers"
     return ""
 
 
-def words_of(size: int | torch.Size) -> str:
-    """Return a shape or a length as text."""
-    return str(size) if isinstance(size, int) else "x".join(map(str, size))
-
-
 def refuse_misfit(trunk: Mapping[str, Tensor], head: Mapping[str, Tensor], net: str) -> None:
-    """Raise InputError if the two files do not hold the weights of a net."""
+    """Raises InputError if two files do not hold the weights of a net."""
     problem = misfit(trunk, head, net)
     if not problem:
         return
@@ -129,10 +132,10 @@ def refuse_misfit(trunk: Mapping[str, Tensor], head: Mapping[str, Tensor], net: 
 
 
 def load_lpips(options: LpipsOptions) -> Lpips | None:
-    """The network, or None without weights (said once in the log).
+    """Loads the network; None without weights.
 
     Raises:
-        InputError: a given file is missing, unreadable or of another network.
+        InputError: a file is missing, unreadable or of another network.
     """
     if bool(options.trunk) != bool(options.head):
         missing = "head" if options.trunk else "trunk"
@@ -145,10 +148,8 @@ def load_lpips(options: LpipsOptions) -> Lpips | None:
     head, head_hash = read_weights(options.head, "metrics.lpips.head")
     refuse_misfit(trunk, head, options.net)
     for stage in network.stages:
-        for number, layer in stage.named_children():
-            if isinstance(layer, nn.Conv2d):
-                layer.load_state_dict({k: trunk[f"features.{number}.{k}"] for k in ("weight", "bias")})
+        stage.load_state_dict({name: trunk[f"features.{name}"] for name in stage.state_dict()})
     for index, parameter in enumerate(network.heads):
-        parameter.data.copy_(head[f"lin{index}.model.1.weight"].flatten())
+        parameter.data.copy_(head[head_name(index)].flatten())
     network.note = f", trunk {trunk_hash}, head {head_hash}"
     return network.eval()
