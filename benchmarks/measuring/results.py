@@ -11,7 +11,7 @@ from typing import Any
 
 from gsx.core.errors import InputError, first_line
 from gsx.core.files import read_json, replace_file, write_json
-from gsx.experiments.reports.charts import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Axis, Plot, Series, axis_of, curve
+from gsx.experiments.reports.charts import Axis, Plot, Series, axis_of, drawing
 from measuring.machine import commit
 
 Section = dict[str, Any]
@@ -156,13 +156,16 @@ def scaling_plot(rows: Sequence[dict[str, Any]]) -> str:
     points = [point for group in curves.values() for point in group]
     plot = Plot(decades(axis_of((x for x, _ in points), log=True)), decades(axis_of((y for _, y in points), log=True)))
     rasters = sorted({raster for _, raster in curves}, key=lambda raster: [len(raster), raster])
-    body = plot.frame("splat-tile pairs") + f'<text x="{LEFT}" y="{TOP}">forward + backward, ms</text>'
+    body = (
+        drawing().frame(plot, "splat-tile pairs")
+        + f'<text x="{plot.LEFT}" y="{plot.TOP}">forward + backward, ms</text>'
+    )
     for number, ((path, raster), group) in enumerate(sorted(curves.items())):
         series = Series(name=path, x=[x for x, _ in group], y=[y for _, y in group], dots=True)
-        line = curve(plot, series) + legend(len(curves) - number, f"{path}, {raster}")
+        line = drawing().curve(plot, series) + legend(len(curves) - number, f"{path}, {raster}")
         body += f"<g {pen(path, rasters.index(raster))}>{line}</g>"
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" width="{2 * WIDTH}">'
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {plot.WIDTH} {plot.HEIGHT}" width="{2 * plot.WIDTH}">'
         f"<style>{STYLE}</style>{body}</svg>\n"
     )
 
@@ -181,6 +184,6 @@ def pen(path: str, number: int) -> str:
 
 def legend(number: int, text: str) -> str:
     """A line of the legend, counted from below: large pictures take long, so the lower right is free."""
-    x, y = WIDTH - RIGHT - 150, HEIGHT - BOTTOM - 14 * number + 4
+    x, y = Plot.right - 150, Plot.bottom - 14 * number + 4
     line = f'<line class="curve" x1="{x}" x2="{x + 22}" y1="{y - 4}" y2="{y - 4}"/>'
     return line + f'<text x="{x + 28}" y="{y}" stroke="none">{html.escape(text)}</text>'

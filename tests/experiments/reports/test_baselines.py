@@ -51,7 +51,7 @@ def test_gains_are_means_over_seeds_with_half_of_their_range() -> None:
 
 
 def test_only_what_both_have_is_compared() -> None:
-    (entry,) = compared([run({"1": 30.0, "2": 28.0}), run({"1": 30.5, "4": 27.0}, augmenter=UP)])
+    ((entry,),) = compared([run({"1": 30.0, "2": 28.0}), run({"1": 30.5, "4": 27.0}, augmenter=UP)])
     assert entry.gains == {"1": [pytest.approx(0.5)]}
 
 
@@ -62,8 +62,8 @@ def test_other_runs_are_no_control(change: dict[str, Any]) -> None:
 
 def test_augmentations_that_differ_are_told_apart() -> None:
     runs = [run({"1": 30.0}), run({"1": 31.0}, augmenter=UP), run({"1": 32.0}, augmenter=WIDE)]
-    assert [row["told"] for row in baseline_rows(runs)] == ["upscale.narrow=0.5", "upscale.narrow=1.0"]
-    assert [row["told"] for row in baseline_rows(runs[:2])] == [""]
+    assert [row["differences"] for row in baseline_rows(runs)] == ["upscale.narrow=0.5", "upscale.narrow=1.0"]
+    assert [row["differences"] for row in baseline_rows(runs[:2])] == [""]
 
 
 def test_folders_and_zooms_looked_at_make_no_difference() -> None:

@@ -18,15 +18,15 @@ from gsx.core.errors import InputError
 from gsx.experiments.reports.charts import (
     Axis,
     Series,
-    compact,
     line_chart,
     linear_ticks,
     pareto_front,
     smoothed,
     thinned,
 )
-from gsx.experiments.reports.page import duration, fixed, signed
-from gsx.experiments.reports.report import write_overview, write_report
+from gsx.experiments.reports.overview import write_overview
+from gsx.experiments.reports.page import compact, duration, fixed, signed
+from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.files import read_run, runs_below, state_of
 
 CONFIG = """\

@@ -81,13 +81,12 @@ def remarks_on(findings: Sequence[Finding], exposures: str, learnt: bool, correc
 
     `exposures`: training.exposure.when; `learnt`: exposures were learnt; `corrected`: poses were corrected.
     """
-    medians = [
-        usual(values) for values in zip(*((f.stops, f.distance, f.concentrated, f.psnr) for f in findings), strict=True)
-    ]
+    values = zip(*((f.stops, f.distance, f.concentrated, f.psnr) for f in findings), strict=True)
+    stops, distance, concentration, quality = map(usual, values)
     remedy = f"training.exposure.when={'auto' if exposures == 'never' else 'always'} learns exposures"
     exposure = "its exposure was learnt" if learnt else remedy
     pose = "even with its pose corrected" if corrected else "training.poses.when=always corrects poses"
-    return [list(remarks(one, *medians, exposure, pose)) for one in findings]
+    return [list(remarks(one, stops, distance, concentration, quality, exposure, pose)) for one in findings]
 
 
 def usual(values: Sequence[float | None]) -> float:

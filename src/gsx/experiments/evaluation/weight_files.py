@@ -29,12 +29,10 @@ def read_weights(path: str, option: str) -> tuple[dict[str, Tensor], str]:
         raise InputError(
             f"{option}={path} cannot be read as weights ({reason}): give a local .pth file with a state dict"
         ) from None
-    return {str(name): value for name, value in weights.items() if is_dense(value)}, hashlib.sha256(data).hexdigest()[
-        :8
-    ]
+    return {name: value for name, value in weights.items() if is_dense(value)}, hashlib.sha256(data).hexdigest()[:8]
 
 
-def state_dict(data: bytes) -> dict[object, object]:
+def state_dict(data: bytes) -> dict[str, Tensor]:
     """Decodes a state dict.
 
     Raises:
@@ -48,7 +46,7 @@ def state_dict(data: bytes) -> dict[object, object]:
         raise ValueError("it is damaged, or holds other things than tensors") from error
     if not isinstance(weights, dict):
         raise ValueError(f"it holds a {type(weights).__name__}, not a state dict")
-    return weights
+    return {str(name): value for name, value in weights.items()}
 
 
 def is_dense(value: object) -> bool:

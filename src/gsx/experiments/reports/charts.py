@@ -1,18 +1,16 @@
-"""Line charts and scatter plots as inline SVG: no script, no library, colours from the page's style sheet."""
+"""Line charts and scatter plots: axes, curves, Pareto fronts and labels, drawn by charts.html."""
 
-import html
 import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
+from typing import Any, ClassVar
 
 from markupsafe import Markup
 
-WIDTH, HEIGHT = 480, 250
-"""Drawing units of a chart; the page scales it."""
-LEFT, RIGHT, TOP, BOTTOM = 54, 14, 10, 38
-"""Margins for labels, drawing units."""
+from gsx.experiments.reports.page import template
+
 LETTER, LINE = 6, 12
 """Width of a letter, about, and height of a line of text, drawing units."""
 MOST_POINTS = 400
@@ -22,11 +20,11 @@ PADDING = 0.04
 COLOURS, DASHES = 6, 3
 """Colours of the page, and ways to draw each: solid, dashed or hollow, dotted or faint."""
 STYLES = COLOURS * DASHES
-"""Curves or points that can be told apart."""
+"""Different styles of curves and points."""
 LEAST, MOST = 1e-30, 1e30
 """Sizes between which logarithmic axes, and beyond which no axes, have room for numbers."""
 DIGITS_DECADES, MOST_DECADES = 4, 8
-"""A logarithmic axis over more decades is marked with powers of ten only; over yet more, with every other one."""
+"""A logarithmic axis over more decades has ticks at powers of ten only; over yet more, at every other one."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +38,13 @@ class Axis:
     """Ticks to use instead of round ones."""
 
     def at(self, value: float) -> float:
-        """Position of a value."""
+        """Returns the position of a value."""
         if self.log:
             return math.log(value / self.low) / math.log(self.high / self.low)
         return (value - self.low) / (self.high - self.low)
 
     def ticks(self) -> list[float]:
-        """Round values inside the range, or those chosen."""
+        """Returns round values inside the range, or those chosen."""
         if self.chosen:
             return list(self.chosen)
         if not self.log:
@@ -68,7 +66,11 @@ class Series:
     y: Sequence[float]
     kind: str = "main"
     dots: bool = False
-    """Mark every point."""
+    """Marks every point."""
+
+    def points(self) -> tuple[list[float], list[float]]:
+        """Returns the points that are drawn."""
+        return thinned(self.x, self.y)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,30 +89,79 @@ class Dot:
     x: float
     y: float
     text: str
-    """Shown on hovering."""
+    """Appears on hovering."""
     label: str
-    """Written beside points of the front."""
+    """Text beside points of the front."""
     colour: int
     """Number of its style."""
     link: str = ""
-    """Where a click leads."""
+    """Target of a click."""
+
+    @property
+    def style(self) -> str:
+        """Returns its classes of the page."""
+        return style(self.colour)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Label:
+    """A text beside a point: its anchored end, base line and left end, drawing units."""
+
+    text: str
+    x: float
+    line: float
+    left: float
+    anchor: str
+
+    def covers(self, other: "Label") -> bool:
+        """Tells whether two texts would overlap."""
+        apart = self.left + LETTER * len(self.text) <= other.left or other.left + LETTER * len(other.text) <= self.left
+        return abs(self.line - other.line) < LINE and not apart
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Two axes on a drawing, whose units the page scales."""
+
+    x: Axis
+    y: Axis
+    WIDTH: ClassVar[int] = 480
+    HEIGHT: ClassVar[int] = 250
+    LEFT: ClassVar[int] = 54
+    RIGHT: ClassVar[int] = 14
+    TOP: ClassVar[int] = 10
+    BOTTOM: ClassVar[int] = 38
+    right: ClassVar[int] = WIDTH - RIGHT
+    bottom: ClassVar[int] = HEIGHT - BOTTOM
+
+    def across(self, value: float) -> float:
+        """Returns the drawing unit of an x value."""
+        return round(self.LEFT + self.x.at(value) * (self.right - self.LEFT), 1)
+
+    def down(self, value: float) -> float:
+        """Returns the drawing unit of a y value."""
+        return round(self.bottom - self.y.at(value) * (self.bottom - self.TOP), 1)
+
+    def points(self, x: Iterable[float], y: Iterable[float]) -> str:
+        """Returns the `points` of a polyline."""
+        return " ".join(f"{self.across(a)},{self.down(b)}" for a, b in zip(x, y, strict=True))
 
 
 def style(number: int) -> str:
-    """Classes of the page for the curve or point of that number: colours first, then other ways to draw them."""
+    """Returns the classes of the page for a curve or point: colours first, then other ways to draw them."""
     return f"k{number % COLOURS} v{number // COLOURS % DASHES}"
 
 
-def linear_ticks(low: float, high: float, wanted: int = 5) -> list[float]:
-    """Multiples of 1, 2 or 5 times a power of ten inside [low, high], about `wanted` of them."""
-    raw = (high - low) / wanted
+def linear_ticks(low: float, high: float, count: int = 5) -> list[float]:
+    """Returns multiples of 1, 2 or 5 times a power of ten inside [low, high], about `count` of them."""
+    raw = (high - low) / count
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(digit * power for digit in (1, 2, 5, 10) if digit * power >= raw * 0.999)
     return [k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
 
 
 def axis_of(values: Iterable[float], log: bool = False, zero: bool = False) -> Axis:
-    """An axis around the values, at most up to MOST; `zero`: it begins at 0."""
+    """Makes an axis around the values, at most up to MOST; `zero`: it begins at 0."""
     known = [min(max(value, -MOST), MOST) for value in values]
     low, high = min(known), max(known)
     if log and low >= LEAST:
@@ -120,16 +171,8 @@ def axis_of(values: Iterable[float], log: bool = False, zero: bool = False) -> A
     return Axis(0.0 if zero else low - room, high + room)
 
 
-def compact(value: float) -> str:
-    """A short number: 1200000 is 1.2M, 30000 is 30k."""
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
-        if abs(value) >= size:
-            return f"{value / (1e3 if letter == 'k' else size):.3g}{letter}"
-    return f"{value:.4g}"
-
-
 def thinned(x: Sequence[float], y: Sequence[float], most: int = MOST_POINTS) -> tuple[list[float], list[float]]:
-    """Means over groups of equal size, so that at most `most` points are left."""
+    """Averages groups of equal size, so that at most `most` points are left."""
     size = math.ceil(len(x) / most) or 1
 
     def means(values: Sequence[float]) -> list[float]:
@@ -140,49 +183,15 @@ def thinned(x: Sequence[float], y: Sequence[float], most: int = MOST_POINTS) -> 
 
 
 def smoothed(values: Sequence[float], reach: int) -> list[float]:
-    """Means over up to `reach` neighbours to either side."""
+    """Averages up to `reach` neighbours on either side."""
     sums = [0.0, *accumulate(values)]
     ends = [(max(0, i - reach), min(len(values), i + reach + 1)) for i in range(len(values))]
     return [(sums[last] - sums[first]) / (last - first) for first, last in ends]
 
 
-@dataclass(frozen=True)
-class Plot:
-    """Two axes and where they lie on the drawing."""
-
-    x: Axis
-    y: Axis
-
-    def across(self, value: float) -> float:
-        """Drawing unit of an x value."""
-        return round(LEFT + self.x.at(value) * (WIDTH - LEFT - RIGHT), 1)
-
-    def down(self, value: float) -> float:
-        """Drawing unit of a y value."""
-        return round(HEIGHT - BOTTOM - self.y.at(value) * (HEIGHT - TOP - BOTTOM), 1)
-
-    def points(self, x: Sequence[float], y: Sequence[float]) -> str:
-        """The `points` of a polyline."""
-        return " ".join(f"{self.across(a)},{self.down(b)}" for a, b in zip(x, y, strict=True))
-
-    def frame(self, x_label: str) -> str:
-        """Grid lines, tick labels and the name of the x axis."""
-        bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
-        parts = []
-        for tick in self.y.ticks():
-            at = self.down(tick)
-            parts.append(f'<line class="grid" x1="{LEFT}" x2="{right}" y1="{at}" y2="{at}"/>')
-            parts.append(f'<text class="tick" x="{LEFT - 7}" y="{at + 4}" text-anchor="end">{compact(tick)}</text>')
-        for tick in self.x.ticks():
-            at = self.across(tick)
-            parts.append(f'<line class="grid" x1="{at}" x2="{at}" y1="{bottom}" y2="{bottom + 4}"/>')
-            parts.append(f'<text class="tick" x="{at}" y="{bottom + 16}" text-anchor="middle">{compact(tick)}</text>')
-        parts.append(f'<line class="axis" x1="{LEFT}" x2="{right}" y1="{bottom}" y2="{bottom}"/>')
-        middle = (LEFT + right) / 2
-        parts.append(
-            f'<text class="name" x="{middle}" y="{HEIGHT - 5}" text-anchor="middle">{html.escape(x_label)}</text>'
-        )
-        return "".join(parts)
+def drawing() -> Any:
+    """Returns the macros of charts.html."""
+    return template("reports/charts.html").module
 
 
 def line_chart(
@@ -193,7 +202,7 @@ def line_chart(
     marks: Sequence[Mark] = (),
     x_ticks: Sequence[float] = (),
 ) -> Markup:
-    """Curves over a common x axis; empty when no series has two points.
+    """Draws curves over a common x axis; empty when no series has two points.
 
     `log`: logarithmic y axis; `x_ticks`: a logarithmic x axis with these ticks, else linear from 0.
     """
@@ -203,57 +212,30 @@ def line_chart(
     places = [x for s in drawn for x in s.x]
     across = replace(axis_of(places, log=True), chosen=tuple(x_ticks)) if x_ticks else axis_of(places, zero=True)
     plot = Plot(across, axis_of((y for s in drawn for y in s.y), log=log))
-    body = plot.frame(x_label) + "".join(mark_line(plot, mark) for mark in marks if plot.x.low <= mark.x <= plot.x.high)
-    body += "".join(curve(plot, s) for s in drawn) + '<line class="cursor" y1="10" y2="212"/>'
-    return svg(body, hover_data(plot, drawn, x_label))
-
-
-def mark_line(plot: Plot, mark: Mark) -> str:
-    """A vertical line."""
-    at = plot.across(mark.x)
-    title = f"<title>{html.escape(mark.text)}</title>"
-    return f'<line class="mark {mark.kind}" x1="{at}" x2="{at}" y1="{TOP}" y2="{HEIGHT - BOTTOM}">{title}</line>'
-
-
-def curve(plot: Plot, series: Series) -> str:
-    """A polyline, with dots where asked for."""
-    x, y = thinned(series.x, series.y)
-    title = f"<title>{html.escape(series.name)}</title>"
-    body = f'<polyline class="curve {series.kind}" points="{plot.points(x, y)}">{title}</polyline>'
-    if series.dots:
-        places = zip(x, y, strict=True)
-        body += "".join(
-            f'<circle class="{series.kind}" cx="{plot.across(a)}" cy="{plot.down(b)}" r="3"/>' for a, b in places
-        )
-    return body
+    inside = [mark for mark in marks if plot.x.low <= mark.x <= plot.x.high]
+    return Markup(drawing().lines(plot, x_label, drawn, inside, hover_data(plot, drawn, x_label)))
 
 
 def hover_data(plot: Plot, series: Sequence[Series], x_label: str) -> str:
-    """What the page's script needs to show values under the pointer."""
-    named = [(s.name, *thinned(s.x, s.y)) for s in series if s.kind != "faint"]
+    """Returns what the page's script needs to show values under the pointer."""
+    named = [(s.name, *s.points()) for s in series if s.kind != "faint"]
     content = {
-        "box": [LEFT, WIDTH - RIGHT],
+        "box": [plot.LEFT, plot.right],
         "x": [plot.x.low, plot.x.high],
         "log": plot.x.log,
         "label": x_label,
-        "series": [{"name": n, "x": digits(x), "y": digits(y)} for n, x, y in named],
+        "series": [{"name": name, "x": digits(x), "y": digits(y)} for name, x, y in named],
     }
     return json.dumps(content, separators=(",", ":"))
 
 
 def digits(values: Iterable[float]) -> list[float]:
-    """Five significant digits."""
+    """Rounds to five significant digits."""
     return [float(f"{value:.5g}") for value in values]
 
 
-def svg(body: str, data: str = "") -> Markup:
-    """The drawing around its parts."""
-    hover = f" data-chart='{html.escape(data)}'" if data else ""
-    return Markup(f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img"{hover}>{body}</svg>')
-
-
 def pareto_front(costs: Sequence[float], gains: Sequence[float]) -> list[int]:
-    """Indices, by rising cost, of points that no other beats: costs no more, gains no less, and is better in one."""
+    """Returns the indices, by rising cost, of points that no other beats: costs no more, gains no less, one better."""
 
     def beaten(i: int) -> bool:
         return any(
@@ -265,43 +247,22 @@ def pareto_front(costs: Sequence[float], gains: Sequence[float]) -> list[int]:
 
 
 def scatter(dots: Sequence[Dot], *, x_label: str) -> Markup:
-    """Points with the Pareto front (lower x, higher y) joined and named; empty without points."""
+    """Draws points, with the Pareto front (lower x, higher y) joined and named; empty without points."""
     if not dots:
         return Markup()
     log = min(dot.x for dot in dots) > 0 and max(dot.x for dot in dots) > 8 * min(dot.x for dot in dots)
     plot = Plot(axis_of((dot.x for dot in dots), log=log), axis_of(dot.y for dot in dots))
-    front = pareto_front([dot.x for dot in dots], [dot.y for dot in dots])
-    line = plot.points([dots[i].x for i in front], [dots[i].y for i in front])
-    body = plot.frame(x_label) + f'<polyline class="front" points="{line}"/>'
-    body += "".join(scatter_dot(plot, dot, i in front) for i, dot in enumerate(dots))
-    return svg(body + labels(plot, [dots[i] for i in front]))
+    front = [dots[i] for i in pareto_front([dot.x for dot in dots], [dot.y for dot in dots])]
+    return Markup(drawing().points(plot, x_label, dots, front, labels(plot, front)))
 
 
-def scatter_dot(plot: Plot, dot: Dot, on_front: bool) -> str:
-    """A point; those of the front are larger."""
-    kind, radius = ("dot best", 5.5) if on_front else ("dot", 4)
-    title = f"<title>{html.escape(dot.text)}</title>"
-    place = f'cx="{plot.across(dot.x)}" cy="{plot.down(dot.y)}"'
-    body = f'<circle class="{kind} {style(dot.colour)}" {place} r="{radius}">{title}</circle>'
-    return f'<a href="{html.escape(dot.link)}">{body}</a>' if dot.link else body
-
-
-def labels(plot: Plot, dots: Sequence[Dot]) -> str:
-    """Names beside points, above or below them, on the side with room; one that would cover another is left out."""
-    body, taken = "", list[tuple[float, float, float]]()
+def labels(plot: Plot, dots: Sequence[Dot]) -> list[Label]:
+    """Places names beside points, above or below them on the side with room, as far as they cover no other."""
+    placed: list[Label] = []
     for dot in dots:
         x, y, width = plot.across(dot.x), plot.down(dot.y), LETTER * len(dot.label)
-        leftwards = x + 8 + width > WIDTH and x > WIDTH / 2
-        left = x - 8 - width if leftwards else x + 8
-        free = [line for line in (y - 7, y + 16) if not any(covers(left, line, width, other) for other in taken)]
-        if free:
-            taken.append((left, free[0], width))
-            anchor, at = ("end", x - 8) if leftwards else ("start", x + 8)
-            text = html.escape(dot.label)
-            body += f'<text class="tick" x="{at:g}" y="{free[0]:g}" text-anchor="{anchor}">{text}</text>'
-    return body
-
-
-def covers(left: float, line: float, width: float, other: tuple[float, float, float]) -> bool:
-    """Whether two texts would overlap: left end, base line and width of each."""
-    return abs(line - other[1]) < LINE and left < other[0] + other[2] and other[0] < left + width
+        leftwards = x + 8 + width > plot.WIDTH and x > plot.WIDTH / 2
+        end, left, anchor = (x - 8, x - 8 - width, "end") if leftwards else (x + 8, x + 8, "start")
+        lines = (Label(text=dot.label, x=end, line=line, left=left, anchor=anchor) for line in (y - 7, y + 16))
+        placed += [one for one in lines if not any(one.covers(other) for other in placed)][:1]
+    return placed

@@ -1,6 +1,6 @@
 """One page over many runs in any state: a table, what cannot be compared, curves, PSNR against its cost, pictures.
 
-Pictures are not copied: the page refers to those in the runs' folders.
+The page refers to pictures in the runs' folders.
 """
 
 import os
@@ -16,7 +16,7 @@ from gsx.experiments.evaluation.remarks import NOT_MEASURED, measures_nothing
 from gsx.experiments.reports.baselines import baseline_rows
 from gsx.experiments.reports.comparison import Entry, compared_runs, groups_of
 from gsx.experiments.reports.page import address, template
-from gsx.experiments.reports.same_scene import told_apart
+from gsx.experiments.reports.same_scene import number_namesakes
 from gsx.experiments.reports.side_by_side import pictures_of
 from gsx.experiments.run_folder.files import (
     STATES,
@@ -32,22 +32,24 @@ from gsx.experiments.run_folder.run_key import comparable
 from gsx.experiments.run_folder.shapes import is_number
 
 DIFFERENCES = 6
-"""Configuration keys in which runs differ that an overview shows."""
+"""Most configuration keys in which runs differ that an overview shows."""
 FIELDS = (
     "run", "state", "reason", "scene", "backbone", "variant", "differences", "iterations", "psnr", "ssim", "lpips",
     "primitives", "megabytes", "seconds", "render_fps", "render_path", "peak_memory_mb", "zoom_gains", "zoom_detail",
     "protocol", "comparable",
 )  # fmt: skip
 """Columns of report.csv."""
+FIGURES = ("psnr", "ssim", "lpips", "primitives", "megabytes", "render_fps", "render_path", "peak_memory_mb")
+"""Columns that evaluation.json has under the same name."""
 
 
 def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
-    """Write report.html and report.csv into a folder, over the runs chosen, or over all runs below it.
+    """Writes report.html and report.csv into a folder, over the runs chosen, or over all runs below it.
 
     Raises:
         InputError: there is no run below it.
     """
-    runs = told_apart([read_run(path) for path in (runs_in([folder]) if chosen is None else chosen)])
+    runs = number_namesakes([read_run(path) for path in (runs_in([folder]) if chosen is None else chosen)])
     rows, baselines = overview_rows(folder, runs), baseline_rows(runs)
     groups = groups_of([Entry(run=run, row=row) for run, row in zip(runs, rows, strict=True)])
     remove_partial(folder, below=False)
@@ -70,14 +72,14 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
 
 
 def title_of(folder: Path, runs: Sequence[RunFiles]) -> str:
-    """How many runs, and where they are if that is one place."""
+    """Says how many runs there are, and where if that is one place."""
     count = f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}"
     together = all(Path(os.path.abspath(run.folder)).is_relative_to(os.path.abspath(folder)) for run in runs)
     return f"{count} below {folder.resolve().name or folder}" if together else count
 
 
 def runs_in(folders: Sequence[Path]) -> list[Path]:
-    """The runs that these folders are or hold, each once, however many ways lead to it.
+    """Lists the runs that these folders are or hold, each once, however many ways lead to it.
 
     Raises:
         InputError: one of them is no folder, or neither is a run nor holds any.
@@ -95,7 +97,7 @@ def runs_in(folders: Sequence[Path]) -> list[Path]:
 
 
 def common_folder(folders: Sequence[Path]) -> Path:
-    """Where an overview of these folders is written: the closest folder above them all that is no run itself.
+    """Returns the closest folder above all of these that is no run itself.
 
     Raises:
         InputError: they have nothing but the root of the file system in common.
@@ -112,59 +114,56 @@ def common_folder(folders: Sequence[Path]) -> Path:
 
 
 def overview_rows(folder: Path, runs: Sequence[RunFiles]) -> list[dict[str, Any]]:
-    """One row for each run."""
-    told = differences(runs)
-    rows = [overview_row(folder, run, told[i]) for i, run in enumerate(runs)]
-    mixed, names = mixed_protocols(rows), names_of(rows)
+    """Returns one row for each run."""
+    rows = [
+        overview_row(folder, run) | {"differences": varied} for run, varied in zip(runs, differences(runs), strict=True)
+    ]
+    mixed = mixed_protocols(rows)
     return [
-        row
-        | {"name": names[i]}
-        | {"comparable": "" if not row["protocol"] else "no" if row["scene"] in mixed else "yes"}
-        for i, row in enumerate(rows)
+        row | {"name": name, "comparable": "" if not row["protocol"] else "no" if row["scene"] in mixed else "yes"}
+        for row, name in zip(rows, names_of(rows), strict=True)
     ]
 
 
-def overview_row(folder: Path, run: RunFiles, told: str) -> dict[str, Any]:
-    """The figures of a run."""
+def overview_row(folder: Path, run: RunFiles) -> dict[str, Any]:
+    """Returns the figures of a run."""
     state, reason = state_of(run)
-    e = run.evaluation
-    zoom = {factor: entry for factor, entry in part(e, "zoom").items() if factor != "1"}
+    evaluation, report = run.evaluation, run.folder / "report.html"
+    zoom = {factor: entry for factor, entry in part(evaluation, "zoom").items() if factor != "1"}
     gains = {factor: gain for factor, entry in zoom.items() if (gain := gain_of(entry)) is not None}
-    report = run.folder / "report.html"
-    unmeasured = NOT_MEASURED if measures_nothing(e) else ""
+    shares = {factor: share for factor, entry in zoom.items() if (share := detail_share(entry)) is not None}
+    unmeasured = NOT_MEASURED if measures_nothing(evaluation) else ""
     return {
-        "run": place(run.folder, folder),
-        "link": address(place(report, folder)) if report.is_file() else "",
+        "run": relative(run.folder, folder),
+        "link": address(relative(report, folder)) if report.is_file() else "",
         "state": state,
         "reason": "; ".join(dict.fromkeys(word for word in (reason, *run.problems.values(), unmeasured) if word)),
         "scene": run.scene,
         "backbone": run.backbone,
         "variant": run.variant,
-        "differences": told,
         "iterations": run.iterations,
-        **{
-            key: e.get(key)
-            for key in ("psnr", "ssim", "lpips", "primitives", "megabytes", "render_fps", "peak_memory_mb")
-        },
-        "render_path": e.get("render_path"),
-        "seconds": e.get("train_seconds"),
+        **{key: evaluation.get(key) for key in FIGURES},
+        "seconds": evaluation.get("train_seconds"),
         "gains": gains,
         "zoom_psnr": {factor: entry["psnr"] for factor, entry in zoom.items() if is_number(entry.get("psnr"))},
-        "zoom_detail": " ".join(
-            f"x{factor}:{share:+.3f}" for factor, entry in zoom.items() if (share := detail_share(entry)) is not None
-        ),
-        "zoom_gains": " ".join(f"x{factor}:{gain:+.3f}" for factor, gain in gains.items()),
+        "zoom_detail": by_zoom(shares),
+        "zoom_gains": by_zoom(gains),
         "protocol": run.protocol_hash,
     }
 
 
-def place(path: Path, folder: Path) -> str:
-    """A path as links in the folder have it."""
+def by_zoom(values: dict[str, float]) -> str:
+    """Formats differences by zoom for report.csv."""
+    return " ".join(f"x{factor}:{value:+.3f}" for factor, value in values.items())
+
+
+def relative(path: Path, folder: Path) -> str:
+    """Returns a path as links in the folder have it."""
     return Path(os.path.relpath(path, folder)).as_posix()
 
 
 def differences(runs: Sequence[RunFiles]) -> list[str]:
-    """For each run its values of the configuration keys in which runs of its scene and variant differ."""
+    """Returns for each run its values of the configuration keys in which runs of its scene and variant differ."""
     groups: dict[tuple[str, str], list[int]] = {}
     for i, run in enumerate(runs):
         groups.setdefault((run.scene, run.variant), []).append(i)
@@ -179,10 +178,10 @@ def differences(runs: Sequence[RunFiles]) -> list[str]:
 
 
 def names_of(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """What each run is called: its variant; where a scene has several of those, also what differs, or its folder."""
+    """Names each run by its variant; where a scene has several of those, also by what differs, or its folder."""
     names = [row["variant"] for row in rows]
-    told = [" ".join(word.split(".")[-1] for word in row["differences"].split(", ") if word) for row in rows]
-    for more in (told, [Path(row["run"]).name for row in rows]):
+    short = [" ".join(word.split(".")[-1] for word in row["differences"].split(", ") if word) for row in rows]
+    for more in (short, [Path(row["run"]).name for row in rows]):
         same = Counter((row["scene"], name) for row, name in zip(rows, names, strict=True))
         names = [
             f"{name} · {word}" if word and same[row["scene"], name] > 1 else name
@@ -192,16 +191,15 @@ def names_of(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def varied_keys(configs: Sequence[dict[str, Any]]) -> list[str]:
-    """Keys whose values are not the same in all configurations, in their order."""
+    """Lists keys whose values are not the same in all configurations, in their order."""
     keys = dict.fromkeys(key for config in configs for key in config)
     return [key for key in keys if len({repr(config.get(key)) for config in configs}) > 1]
 
 
 def mixed_protocols(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
-    """Scenes evaluated by several protocols: how many runs by each hash."""
-    counts: dict[str, dict[str, int]] = {}
+    """Counts runs by protocol for scenes that were evaluated by several."""
+    counts: dict[str, Counter[str]] = {}
     for row in rows:
         if row["protocol"]:
-            by_hash = counts.setdefault(row["scene"], {})
-            by_hash[row["protocol"]] = by_hash.get(row["protocol"], 0) + 1
-    return {scene: by_hash for scene, by_hash in counts.items() if len(by_hash) > 1}
+            counts.setdefault(row["scene"], Counter())[row["protocol"]] += 1
+    return {scene: dict(by_hash) for scene, by_hash in counts.items() if len(by_hash) > 1}

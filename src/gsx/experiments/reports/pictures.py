@@ -1,6 +1,6 @@
-"""Pictures of a run for people: test views beside their truth, error maps, and zoomed crops beside their competitor.
+"""Pictures of a run: test views with their truth, error maps, and zoomed crops with their competitor.
 
-Everything goes to the run's `renders/`, listed in `index.json`, from which the report is built again at any time.
+They go to the run's `renders/` with an `index.json`, from which the report is made.
 """
 
 import math
@@ -25,13 +25,13 @@ from gsx.experiments.evaluation.evaluator import Zoomed
 SHOWN = 6
 """Test views that are drawn."""
 PICTURE_WIDTH = 1600
-"""Wider pictures are saved reduced to this, in px: they are for looking, and the report embeds them."""
+"""Wider pictures are saved reduced to this, in px, since the report embeds them."""
 LOSSLESS_PIXELS = 400_000
 """Larger pictures are saved as JPEG."""
 WINDOW = 192
-"""Edge of a zoomed crop on the finer raster, px: the report shows three side by side at twice that."""
+"""Edge of a zoomed crop on the finer raster, px."""
 WINDOW_STEP = 8
-"""Crops are looked for on a grid of this many px."""
+"""Grid of crops, px."""
 ERROR_FULL = 0.2
 """Mean absolute error over the channels at which an error map is brightest, in display units of [0, 1]."""
 DRAWN = re.compile(r".+\.(truth|render|error|enlarged|depth)\.(png|jpg)")
@@ -50,21 +50,21 @@ ERROR_COLOURS = (
 
 
 class Pictures:
-    """Draws up to SHOWN test views and their zoomed crops, and lists them (implements `evaluator.Drawing`)."""
+    """Pictures of up to SHOWN test views and their zoomed crops, with an index (implements `evaluator.Drawing`)."""
 
     def __init__(self, folder: Path, step: int) -> None:
         self.folder, self.step = folder, step
         self.shown: dict[int, dict[str, Any]] = {}
-        """What is known of the views to be drawn."""
+        """Index entries of the views to draw, by number."""
         self.names: dict[int, str] = {}
         """Their file names."""
         self.views: list[dict[str, Any]] = []
         self.crops: list[dict[str, Any]] = []
         self.flight: dict[str, Any] = {}
-        """From a whole view into its detail, frame below frame."""
+        """Entry of the flight into a view's detail."""
 
     def choose(self, figures: Sequence[dict[str, Any]]) -> None:
-        """Best and worst are among the views drawn; pictures of an earlier evaluation are removed."""
+        """Chooses the views to draw, best and worst among them; removes pictures of an earlier evaluation."""
         self.folder.mkdir(parents=True, exist_ok=True)
         forget(self.folder)
         if not figures:
@@ -72,34 +72,33 @@ class Pictures:
         best, worst = extremes([figure["psnr"] for figure in figures])
         roles = {worst: "worst", best: "best"} if best != worst else {}
         numbers = spread(len(figures), SHOWN, {best, worst})
-        told = ("name", "group", "psnr", "ssim", "lpips")
-        self.shown = {i: {key: figures[i][key] for key in told} | {"role": roles.get(i, "")} for i in numbers}
+        keys = ("name", "group", "psnr", "ssim", "lpips")
+        self.shown = {i: {key: figures[i][key] for key in keys} | {"role": roles.get(i, "")} for i in numbers}
         self.names = dict(zip(numbers, file_names([figures[i]["name"] for i in numbers]), strict=True))
 
     def whole(self, number: int, view: View, render: Float[Tensor, "3 H W"]) -> None:
-        """Truth, render and error of a view."""
+        """Draws truth, render and error of a view."""
         if number not in self.shown:
             return
         files = self.compared(self.names[number], view, render)
         self.views.append(self.shown[number] | {"size": list(view.camera.size), "files": files})
 
     def compared(self, name: str, view: View, render: Float[Tensor, "3 H W"]) -> dict[str, str]:
-        """Write truth, render and error of a view; returns their files by kind."""
+        """Writes truth, render and error of a view; returns their files by kind."""
         truth = view.image()
         error = error_map(*(blacked(picture, view.counted()) for picture in (render, truth)))
         images = {"truth": truth, "render": render, "error": error}
         return {kind: self.save(f"{name}.{kind}", reduced(image)) for kind, image in images.items()}
 
     def zoomed(self, number: int, zoomed: Zoomed) -> None:
-        """The window with most detail: truth, render and the x1 render resized."""
+        """Draws the window with most detail: truth, render and the x1 render resized."""
         if number not in self.shown:
             return
-        window, counted = most_detailed(zoomed.truth, WINDOW, zoomed.counted), zoomed.counted
-        inside = None if counted is None else window.cut(counted[None])[0]
+        window = most_detailed(zoomed.truth, WINDOW, zoomed.counted)
+        inside = None if zoomed.counted is None else window.cut(zoomed.counted[None])[0]
         if inside is not None and not inside.any():
             return
-        whole = {"truth": zoomed.truth, "render": zoomed.render, "enlarged": zoomed.enlarged}
-        images = {kind: window.cut(image) for kind, image in whole.items()}
+        images = {kind: window.cut(getattr(zoomed, kind)) for kind in ("truth", "render", "enlarged")}
         stem = f"{self.names[number]}.x{zoomed.factor:g}"
         self.crops.append(
             {
@@ -113,21 +112,21 @@ class Pictures:
         )
 
     def save(self, stem: str, image: Float[Tensor, "3 H W"], lossless: bool = False, lossy: bool = False) -> str:
-        """Write one picture and return its file name."""
+        """Writes a picture; returns its file name."""
         small = image.shape[1] * image.shape[2] <= LOSSLESS_PIXELS and not lossy
         file = f"{stem}.png" if lossless or small else f"{stem}.jpg"
         write_image(self.folder / file, image)
         return file
 
     def write_index(self) -> None:
-        """List what was drawn."""
+        """Writes the index."""
         index = {"error_full": ERROR_FULL, "step": self.step, "views": self.views, "zoom": self.crops}
         index |= {"flight": self.flight} if self.flight else {}
         write_json(self.folder / "index.json", index)
 
 
 def forget(folder: Path) -> None:
-    """Remove the pictures of an earlier evaluation, be it one that did not come to its end; first their index."""
+    """Removes the index and the pictures of an earlier evaluation, which may be incomplete."""
     (folder / "index.json").unlink(missing_ok=True)
     for path in folder.iterdir():
         if DRAWN.fullmatch(path.name) and path.is_file():
@@ -135,38 +134,36 @@ def forget(folder: Path) -> None:
 
 
 def extremes(qualities: Sequence[float | None]) -> tuple[int, int]:
-    """Indices of the best and the worst; None, no number, is worst of all."""
+    """Returns the indices of the best and the worst; None is worst of all."""
     known = [-math.inf if quality is None else quality for quality in qualities]
     return known.index(max(known)), known.index(min(known))
 
 
 def spread(total: int, count: int, always: Set[int]) -> list[int]:
-    """Up to `count` of `total` indices in order: those in `always`, then an even spacing, then whatever is left."""
-    wanted = min(count, total)
-    even = [round(k * (total - 1) / max(1, wanted - 1)) for k in range(wanted)]
-    return sorted(list(dict.fromkeys([*sorted(always), *even, *range(total)]))[:wanted])
+    """Chooses up to `count` of `total` indices: those in `always`, then evenly spaced ones, then the first others."""
+    count = min(count, total)
+    even = [round(k * (total - 1) / max(1, count - 1)) for k in range(count)]
+    return sorted(list(dict.fromkeys([*sorted(always), *even, *range(total)]))[:count])
 
 
 def file_names(names: Iterable[str]) -> list[str]:
-    """View names as file names: without image suffix and odd characters, numbered where two would be equal."""
+    """Turns view names into file names: without image suffix and odd characters, numbered where two would be equal."""
     out: list[str] = []
     for name in names:
         plain = re.sub(r"\.(png|jpe?g|exr|webp|tiff?)$", "", name, flags=re.IGNORECASE)
         safe = re.sub(r"[^A-Za-z0-9_-]+", "_", plain).strip("_") or "view"
-        taken, number = safe, 2
-        while taken in out:
-            taken, number = f"{safe}_{number}", number + 1
-        out.append(taken)
+        candidates = (safe, *(f"{safe}_{number}" for number in range(2, len(out) + 2)))
+        out.append(next(name for name in candidates if name not in out))
     return out
 
 
 def error_map(image: Float[Tensor, "3 H W"], truth: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """Mean absolute error over the channels as a colour: black is none, the brightest is ERROR_FULL or more."""
+    """Colours the mean absolute error over the channels: black is none, the brightest is ERROR_FULL or more."""
     return colour_ramp((image - truth).abs().mean(0) / ERROR_FULL)
 
 
 def colour_ramp(values: Float[Tensor, "H W"]) -> Float[Tensor, "3 H W"]:
-    """ERROR_COLOURS, linear in between; values are clamped to [0, 1]."""
+    """Interpolates ERROR_COLOURS linearly; clamps values to [0, 1]."""
     places = torch.tensor([place for place, _ in ERROR_COLOURS])
     colours = torch.tensor([colour for _, colour in ERROR_COLOURS]) / 255
     clamped = values.clamp(0, 1)
@@ -177,7 +174,7 @@ def colour_ramp(values: Float[Tensor, "H W"]) -> Float[Tensor, "3 H W"]:
 
 
 def reduced(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 h w"]:
-    """At most PICTURE_WIDTH wide."""
+    """Reduces a picture to at most PICTURE_WIDTH."""
     width, height = image.shape[2], image.shape[1]
     if width <= PICTURE_WIDTH:
         return image
@@ -186,8 +183,7 @@ def reduced(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 h w"]:
 
 
 def most_detailed(image: Float[Tensor, "3 H W"], edge: int, counted: Bool[Tensor, "H W"] | None = None) -> Window:
-    """The square of that edge (or as much of it as there is) with the largest gradient energy, on a coarse grid; that
-    between pixels that count."""
+    """Finds the square of that edge, or less, with the largest gradient energy of counted pixels, on a coarse grid."""
     height, width = min(edge, image.shape[1]), min(edge, image.shape[2])
     energy = gradient_energy(image)
     if counted is not None:
@@ -201,7 +197,7 @@ def most_detailed(image: Float[Tensor, "3 H W"], edge: int, counted: Bool[Tensor
 
 
 def gradient_energy(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "H W"]:
-    """Squared differences to the right and lower neighbours, summed over the channels."""
+    """Sums squared differences to the right and lower neighbours over the channels."""
     energy = torch.zeros_like(image[0])
     energy[:, :-1] += (image[:, :, 1:] - image[:, :, :-1]).square().sum(0)
     energy[:-1] += (image[:, 1:] - image[:, :-1]).square().sum(0)

@@ -1,6 +1,6 @@
-"""Scenes of one name that are not one: folders are often called alike (`dense`, `images`), and so are their files."""
+"""Scenes of one name that differ: folders are often called alike (`dense`, `images`), and so are their files."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +11,8 @@ from gsx.core.errors import GsxError
 from gsx.experiments.run_folder.files import RunFiles, part
 
 
-def told_apart(runs: Sequence[RunFiles]) -> list[RunFiles]:
-    """The runs, those of another scene of the same name with its number (`RunFiles.scene`)."""
+def number_namesakes(runs: Sequence[RunFiles]) -> list[RunFiles]:
+    """Numbers the scenes of one name that differ (`RunFiles.namesake`)."""
     first: dict[str, list[RunFiles]] = {}
     out = []
     for run in runs:
@@ -25,23 +25,24 @@ def told_apart(runs: Sequence[RunFiles]) -> list[RunFiles]:
 
 
 def differ(run: RunFiles, other: RunFiles) -> bool:
-    """Whether runs whose scenes lie in different folders show other pixels in a test photograph of one name and size;
-    False where none can be compared."""
+    """Tells whether scenes in different folders have other pixels in a test photo of one name and size."""
     if part(run.config, "scene").get("path") == part(other.config, "scene").get("path"):
         return False
-    truths = dict(truths_of(other))
-    return any(unlike(file, truths[key]) for key, file in truths_of(run) if key in truths)
+    truths, others = truths_of(run), truths_of(other)
+    return any(unlike(truths[key], others[key]) for key in truths.keys() & others.keys())
 
 
-def truths_of(run: RunFiles) -> Iterator[tuple[tuple[str, str], Path]]:
-    """((name, size), file) of the photographs of test views that a run shows."""
-    for view in run.pictures.get("views", []):
-        if name := part(view, "files").get("truth"):
-            yield (str(view.get("name")), str(view.get("size"))), run.folder / "renders" / Path(str(name)).name
+def truths_of(run: RunFiles) -> dict[tuple[str, str], Path]:
+    """Returns the photos of drawn test views by name and size."""
+    return {
+        (str(view.get("name")), str(view["size"])): run.folder / "renders" / Path(view["files"]["truth"]).name
+        for view in run.pictures.get("views", [])
+        if part(view, "files").get("truth")
+    }
 
 
 def unlike(one: Path, other: Path) -> bool:
-    """Whether two picture files show other pixels; False where one cannot be read."""
+    """Tells whether two picture files have other pixels; False where one cannot be read."""
     try:
         return one.read_bytes() != other.read_bytes() and not torch.equal(read_image(one), read_image(other))
     except (OSError, GsxError):

@@ -1,7 +1,6 @@
 """One page to send: a model inside a viewer that opens from disk, without network.
 
-The viewer is npm's @playcanvas/supersplat-viewer (MIT), with its notice in the page; `scripts/viewer_template.py` has
-made the empty page out of it.
+The viewer is npm's @playcanvas/supersplat-viewer (MIT), with its notice; `scripts/viewer_template.py` made the page.
 """
 
 import base64
@@ -25,15 +24,15 @@ from gsx.formats.compressed_ply import encode_compressed_ply
 
 TEMPLATE = "viewer_page.html.xz"
 PLACE = '"GSX_BOOTSTRAP"'
-"""Where settings and splats go (scripts/viewer_template.py)."""
+"""Place of settings and splats (scripts/viewer_template.py)."""
 NAME = "model.compressed.ply"
-"""What the viewer takes the splats for."""
+"""File name that tells the viewer the format."""
 VIEWER_FROM_FILE = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
 """The viewer turns files by half a turn about z, and has y up."""
 LEAST_LEVEL = 0.97
-"""Cosine of the roll (14 degrees) up to which a camera counts as held level."""
+"""Cosine of the largest roll (14 degrees) of a camera that counts as level."""
 FIELD_OF_VIEW = (10.0, 120.0)
-"""Degrees that the viewer has for cameras."""
+"""Range of the viewer's cameras, degrees."""
 
 
 def viewer_page(
@@ -44,9 +43,9 @@ def viewer_page(
     title: str,
     comments: Sequence[str] = (),
 ) -> str:
-    """The page; it starts at the first of some views, and has the others as places to go to.
+    """Makes the page, which starts at the first view and offers the others as places.
 
-    up: of the scene, a unit vector; background: display RGB in [0, 1].
+    `up`: unit vector of the scene; `background`: display RGB in [0, 1].
     """
     rotation = rotation_between(level(up, views[0].camera), torch.tensor([0.0, -1.0, 0.0]))  # files have y down
     splats = encode_compressed_ply(arrays_of(turned(gaussians, rotation)), comments)
@@ -63,14 +62,14 @@ def viewer_page(
 
 
 def level(up: Float[Tensor, "3"], camera: Camera) -> Float[Tensor, "3"]:
-    """The scene's up direction, turned by the roll of a camera that is held almost level: the viewer knows none."""
+    """Turns the scene's up direction by the small roll of a camera, since the viewer's cameras have none."""
     right = camera.rotation[0].double()
     across = torch.nn.functional.normalize(up.double() - (up.double() @ right) * right, dim=0)
     return across if float(across @ up.double()) > LEAST_LEVEL else up
 
 
 def pose(camera: Camera, rotation: Float[Tensor, "3 3"], means: Float[Tensor, "N 3"]) -> dict[str, object]:
-    """A camera as the viewer has it: it looks at the median depth of what is before it, and stands upright."""
+    """Converts a camera: the viewer's looks at the median depth before it, and stands upright."""
     depths = camera.to_camera(means)[:, 2]
     ahead = float(depths[depths > camera.near].median()) if bool((depths > camera.near).any()) else 1.0
     centre = camera.centre.double()
@@ -84,7 +83,7 @@ def pose(camera: Camera, rotation: Float[Tensor, "3 3"], means: Float[Tensor, "N
 def settings(
     poses: Sequence[dict[str, object]], names: Sequence[str], background: Sequence[float]
 ) -> dict[str, object]:
-    """Settings of the viewer, version 2 (its docs/api.md): colours as they are, no effects."""
+    """Makes settings of the viewer, version 2 (its docs/api.md), without effects."""
     off = {"enabled": False}
     return {
         "version": 2,

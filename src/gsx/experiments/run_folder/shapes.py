@@ -1,7 +1,7 @@
 """Shapes of the JSON files of a run folder: a file that does not fit counts as damaged."""
 
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, TypeAlias, TypeGuard
 
 LARGEST = 1e100
 """Larger numbers occur in no run and are not safe to compute with."""
@@ -42,6 +42,11 @@ def is_size(value: Any) -> bool:
     return is_range(value) and min(value) > 0
 
 
+def is_window(value: Any) -> bool:
+    """Recognises the left, top, width and height of a window; the last two are above 0."""
+    return isinstance(value, list) and len(value) == 4 and all(map(is_number, value)) and min(value[2:]) > 0
+
+
 def is_decimal(word: str) -> bool:
     """Recognises a key of JSON that spells a number."""
     try:
@@ -55,11 +60,13 @@ def is_file_name(name: Any) -> bool:
     return isinstance(name, str) and Path(name).name not in ("", "..")
 
 
-PICTURES = {is_text: is_file_name}
-SHARES = {is_text: is_number}
-COUNTS = {is_decimal: is_number}
-PSEUDO = {"asked": COUNTS, "dropped": COUNTS, "warned": {is_text: COUNTS}}
-LINE = {
+Shape: TypeAlias = dict[Any, Any]
+
+PICTURES: Shape = {is_text: is_file_name}
+SHARES: Shape = {is_text: is_number}
+COUNTS: Shape = {is_decimal: is_number}
+PSEUDO: Shape = {"asked": COUNTS, "dropped": COUNTS, "warned": {is_text: COUNTS}}
+LINE: Shape = {
     "step": is_number,
     "memory_mb?": is_count,
     "withheld?": is_count,
@@ -67,7 +74,7 @@ LINE = {
     "pseudo?": {is_text: PSEUDO},
 }
 """A line of metrics.jsonl, as far as a run that goes on reads it again."""
-EVALUATION = {
+EVALUATION: Shape = {
     "step?": is_count,
     "views?": [{"name?": is_text}],
     "zoom?": {is_decimal: {}},
@@ -78,16 +85,16 @@ EVALUATION = {
     "left_out?": is_count,
     "remarks?": [is_text],
 }
-ENVIRONMENT = {"scene?": {"notes?": is_list}, "history?": [{"changed?": {is_text: is_pair}}]}
-DRAWN = {
+ENVIRONMENT: Shape = {"scene?": {"notes?": is_list}, "history?": [{"changed?": {is_text: is_pair}}]}
+DRAWN: Shape = {
     "views?": [{"size": is_size, "files?": PICTURES, "depth?": is_range}],
-    "zoom?": [{"factor": is_number, "files?": PICTURES}],
+    "zoom?": [{"factor": is_number, "window": is_window, "files?": PICTURES}],
     "flight?": {"file": is_file_name, "size": is_size, "frames": is_number},
 }
-PSEUDO_VIEWS = {"views?": [{}]}
-PHOTOGRAPHS = {"step?": is_count, "views": [{"name": is_text, "remarks": is_list, "files?": PICTURES}]}
-STATUS = {"step?": is_count}
-COMPACT = {"from": is_text}
+PSEUDO_VIEWS: Shape = {"views?": [{}]}
+PHOTOGRAPHS: Shape = {"step?": is_count, "views": [{"name": is_text, "remarks": is_list, "files?": PICTURES}]}
+STATUS: Shape = {"step?": is_count}
+COMPACT: Shape = {"from": is_text}
 
 
 def fits(value: Any, shape: Any) -> bool:
