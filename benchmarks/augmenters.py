@@ -73,7 +73,7 @@ FAMILIES = {
         once=("upscale_paper + bootstrap", "upscale", "upscale, oracle"),
     ),
     "octree_scaffold preset=octree_zoom": Family(
-        control=("backbone=octree_scaffold", "preset=octree_zoom", "training.supersample=1"),
+        control=("backbone=octree_scaffold", "preset=octree_zoom", "training.supersampling.factor=1"),
         added={"upscale + bootstrap": (BOTH,)},
         once=("upscale + bootstrap",),
     ),

@@ -48,8 +48,8 @@ TRADES: dict[str, dict[str, tuple[str, ...]]] = {
         "cooled down": ("training.cooldown=0.2",),
     },
     "resolution": {
-        "coarse to fine": ("training.coarse=2", "training.coarse_until=0.3"),
-        "supersampled at last": ("training.supersample=2", "training.supersample_from=0.8"),
+        "coarse to fine": ("training.coarse_to_fine.factor=2", "training.coarse_to_fine.until=0.3"),
+        "supersampled at last": ("training.supersampling.factor=2", "training.supersampling.start=0.8"),
     },
     "filter": {"mip": ("backbone.filter=mip",)},
     "colour": {"SH degree 1": ("backbone.sh_degree=1",)},

@@ -55,7 +55,7 @@ ZOOMS = ("1", "2", "4")
 MIP = ("backbone=mip_splatting",)
 ZOOM = (*MIP, "preset=zoom", "backbone.capacity=published")
 """Growth has tables of its own (benchmarks/capacity.py)."""
-EARLY = (*ZOOM, "training.supersample_from=0.5")
+EARLY = (*ZOOM, "training.supersampling.start=0.5")
 COMPOSITIONS = {"mip_splatting": MIP, "preset=zoom": ZOOM}
 """Overrides by the name of a row."""
 VIEWS = {"mip_splatting": MIP, "preset=zoom, views=2": (*ZOOM, "backbone.mip.views=2")}
@@ -64,8 +64,8 @@ COOLED = {"preset=zoom, rates held": (*ZOOM, "training.cooldown=0"), "preset=zoo
 """With learning rates that stay, and that go down at the end."""
 PARTS = {
     "mip_splatting": MIP,
-    "finer pixels alone": (*MIP, "training.supersample=2", "training.supersample_from=0.5"),
-    "rates alone": (*EARLY, "training.supersample=1"),
+    "finer pixels alone": (*MIP, "training.supersampling.factor=2", "training.supersampling.start=0.5"),
+    "rates alone": (*EARLY, "training.supersampling.factor=1"),
     "finer pixels and rates": EARLY,
 }
 """Finer pixels in the second half of the steps."""
@@ -193,7 +193,9 @@ def seen_from_afar(folder: Path, way: str, overrides: Sequence[str]) -> float:
         run, settings = open_run(folder, plugins(), overrides)
         evaluator, test = Evaluator(run, settings.evaluation), run.scene.test
         views = [view.zoom(AFAR) for view in test[:: -(-len(test) // FEW)]]
-        shown = [(evaluator.measured(evaluator.rendered(v, AFAR).image), v.image()) for v in views if v is not None]
+        shown = [
+            (evaluator.measured(evaluator.renders.render(v, AFAR).image), v.image()) for v in views if v is not None
+        ]
         write_json(path, {"psnr": statistics.mean(psnr(image, truth) for image, truth in shown)})
     return float(read_json(path)["psnr"])
 

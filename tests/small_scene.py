@@ -54,7 +54,7 @@ def published_options(**density: float) -> GS3DOptions:
 
 
 def small_context(scene: Scene, *, iterations: int = 30000, seed: int = 0, **more: Any) -> BackboneContext:
-    """What a backbone on the CPU is built from; `more`: of its resolution."""
+    """What a backbone on the CPU is built from; `more`: of its training views."""
     return BackboneContext(
         scene=scene,
         iterations=iterations,
@@ -68,7 +68,7 @@ def small_context(scene: Scene, *, iterations: int = 30000, seed: int = 0, **mor
 def small_gs3d(
     scene: Scene, *, iterations: int = 30000, seed: int = 0, options: GS3DOptions | None = None, **more: Any
 ) -> GS3D:
-    """The backbone at step 0; `more`: of its resolution."""
+    """The backbone at step 0; `more`: of its training views."""
     return gs3d(options or published_options(), small_context(scene, iterations=iterations, seed=seed, **more))
 
 

@@ -8,8 +8,8 @@ from gsx.core.plugins import Plugins, Registry, hookimpl, load_plugins
 
 @hookimpl
 def gsx_register(registry: Registry) -> None:
-    """Registers scenes, backbones, augmenters, regenerators and trackers of gsx itself."""
-    for add in (add_scenes, add_backbones, add_augmenters, add_regenerators, add_diffusion, add_trackers):
+    """Registers scenes, backbones, modules, augmenters, regenerators and trackers of gsx itself."""
+    for add in (add_scenes, add_backbones, add_modules, add_augmenters, add_regenerators, add_diffusion, add_trackers):
         add(registry)
 
 
@@ -40,6 +40,25 @@ def add_backbones(registry: Registry) -> None:
     registry.add("backbone", "scaffold", neural_anchors, NeuralOptions)
     registry.add("backbone", "octree_scaffold", neural_anchors, NeuralOptions)
     registry.add("backbone", "octree_gs3d", octree_gs3d, OctreeGS3DOptions)
+
+
+def add_modules(registry: Registry) -> None:
+    """Schedules, stopping rules and corrections of photos, in the order in which a run has them."""
+    from gsx.modules.blur import Blur, BlurOptions
+    from gsx.modules.coarse_to_fine import CoarseToFine, CoarseToFineOptions
+    from gsx.modules.distractors import DistractorOptions, Distractors
+    from gsx.modules.exposure import Exposure, ExposureOptions
+    from gsx.modules.plateau import Plateau, PlateauOptions
+    from gsx.modules.poses import PoseOptions, Poses
+    from gsx.modules.supersampling import Supersampling, SupersamplingOptions
+
+    registry.add("module", "coarse_to_fine", CoarseToFine, CoarseToFineOptions)
+    registry.add("module", "supersampling", Supersampling, SupersamplingOptions)
+    registry.add("module", "plateau", Plateau, PlateauOptions)
+    registry.add("module", "poses", Poses, PoseOptions)
+    registry.add("module", "exposure", Exposure, ExposureOptions)
+    registry.add("module", "blur", Blur, BlurOptions)
+    registry.add("module", "distractors", Distractors, DistractorOptions)
 
 
 def add_augmenters(registry: Registry) -> None:

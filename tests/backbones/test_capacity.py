@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from module_contexts import build_module
 from safetensors.torch import load_file
 from small_scene import Grey, published_options, small_context, small_gs3d, small_scene, spread
 from test_anchors import small_anchors
@@ -30,9 +31,9 @@ from gsx.core.training.importance import Probe, Removal
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.validation import decibels, part_of
 from gsx.experiments.reports.report import growth_chart
-from gsx.modules.bilateral_grid import RANK, through_grid
-from gsx.modules.blur import Blur
-from gsx.modules.exposure import Exposures
+from gsx.modules.bilateral_grid import RANK, apply_grid
+from gsx.modules.blur import Blur, BlurOptions
+from gsx.modules.exposure import Exposure, ExposureOptions
 from gsx.modules.movement import motion_blurred
 
 PUBLISHED = Growing(500, 15000, 100)
@@ -353,24 +354,27 @@ def test_photographs_are_compared_with_what_they_would_show_of_the_model(how: st
     of it does far worse."""
     bare = small_scene(spread(40), torch.full((40, 3), 200, dtype=torch.uint8), background=0.1)
     model, gain = small_gs3d(bare, options=options_of("adaptive")), {"dark": 0.5, "bright": 2.5}.get(how, 1.0)
-    across, names, shown = 3.0 if how == "moved" else 0.0, [view.name for view in bare.train], []
+    across, shown = 3.0 if how == "moved" else 0.0, []
     light = torch.zeros(RANK, 3, 4)
     light[1, :, :3] = 0.5 * torch.eye(3) if how == "shaded" else 0.0
     for view in bare.train:
         splats = model.draw(view.camera, 700).splats
         image = rasterize(splats, view.camera, model.raster, background=bare.background).image.detach()
-        photographed = gain * through_grid(motion_blurred(image, across, 0.0), light)
+        photographed = gain * apply_grid(motion_blurred(image, across, 0.0), light)
         shown.append((255 * photographed).round().clamp(0, 255).byte())
     scene = replace(bare, train=[replace(v, source=Printed(p)) for v, p in zip(bare.train, shown, strict=True)])
     half, lost, found = with_rows(model.table, torch.arange(40) < 20), [], []
-    exposures, blur = Exposures(names=names), Blur()
+    exposure, blur = (
+        build_module(Exposure, ExposureOptions(), scene=scene),
+        build_module(Blur, BlurOptions(), scene=scene),
+    )
     for known in (False, True):
         if known and how == "moved":
             blur.movements = {view.name: (across / view.camera.width, 0.0) for view in scene.train}
         elif known:
-            matrices = torch.cat([gain * torch.eye(3), torch.zeros(3, 1)], 1).repeat(len(names), 1, 1)
-            exposures.begin(matrices, light.repeat(len(names), 1, 1, 1) if how == "shaded" else None)
-        context = small_context(scene, exposures=exposures, blur=blur)
+            matrices = torch.cat([gain * torch.eye(3), torch.zeros(3, 1)], 1).repeat(len(scene.train), 1, 1)
+            exposure.start(matrices, light.repeat(len(scene.train), 1, 1, 1) if how == "shaded" else None)
+        context = small_context(scene, modules={"exposure": exposure, "blur": blur})
         judge = Adaptive(AdaptiveOptions(window=0.5 if how == "shaded" else 1.0), context, PUBLISHED, 0)
         lost.append(judge.gain(model, model.table, half, 700)[0])
         found.append(worth_in_training(model, context, 700))

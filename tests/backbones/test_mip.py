@@ -355,7 +355,7 @@ def test_an_event_leaves_the_sizes_of_the_new_means() -> None:
 
 
 def cameras_of(backbone: GS3D) -> list[Camera]:
-    return backbone.filter.context.views.rendered_cameras(1)
+    return backbone.filter.context.views.raster_cameras(1)
 
 
 def drawn_opacities(backbone: GS3D) -> Tensor:

@@ -12,7 +12,7 @@ from gsx.core.options import flattened
 from gsx.core.ranges import Range, Share, beyond_range, without_range
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.run import TrainingOptions
-from gsx.experiments.evaluation.evaluator import EvalOptions
+from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.run_folder.general_options import GeneralOptions
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.settings import Budget

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from module_contexts import build_module
 from tiny import final_tensors, stopped_at, tiny_run
 from torch import Tensor
 
 from gsx.core.data.window import Window
-from gsx.modules.bilateral_grid import RANK, first_matrices, slopes_of_light, through_grid, without_common
-from gsx.modules.exposure import ExposureOptions, Exposures
+from gsx.modules.bilateral_grid import RANK, apply_grid, initial_grids, light_slopes, without_common
+from gsx.modules.exposure import Exposure, ExposureOptions, Measure, light_of
 
-CPU = torch.device("cpu")
 ALL = torch.ones(36, 48, dtype=torch.bool)
 
 
@@ -35,19 +35,19 @@ def test_a_pixel_gains_what_its_place_and_luma_say() -> None:
     weights = torch.tensor([2 * 0.3581 - 1, x, y, x * x - 1 / 3, y * y - 1 / 3])
     matrix = (weights[:, None, None] * matrices).sum(0)
     expected = image[:, 0, 3] + matrix @ torch.tensor([0.5, 0.2, 0.8, 1.0])
-    torch.testing.assert_close(through_grid(image, matrices)[:, 0, 3], expected)
-    assert torch.equal(through_grid(image, torch.zeros(RANK, 3, 4)), image)
+    torch.testing.assert_close(apply_grid(image, matrices)[:, 0, 3], expected)
+    assert torch.equal(apply_grid(image, torch.zeros(RANK, 3, 4)), image)
 
 
 def test_a_window_is_changed_as_its_part_of_the_picture() -> None:
     image, matrices, window = noise(3, 20, 30), 0.3 * noise(RANK, 3, 4, seed=1), Window(7, 4, 11, 9)
-    part = through_grid(window.cut(image), matrices, window.shares(30, 20))
-    torch.testing.assert_close(part, window.cut(through_grid(image, matrices)))
+    part = apply_grid(window.cut(image), matrices, window.shares(30, 20))
+    torch.testing.assert_close(part, window.cut(apply_grid(image, matrices)))
 
 
 def test_gradients_are_those_of_finite_differences() -> None:
     image, matrices = 0.1 + 0.8 * noise(3, 3, 4).double(), 0.3 * noise(RANK, 3, 4, seed=1).double()
-    torch.autograd.gradcheck(through_grid, (image.requires_grad_(), matrices.requires_grad_()))
+    torch.autograd.gradcheck(apply_grid, (image.requires_grad_(), matrices.requires_grad_()))
 
 
 def shaded(image: Tensor, across: float, down: float) -> Tensor:
@@ -60,24 +60,24 @@ def test_slopes_are_told_beside_bows_and_by_pixels_that_tell() -> None:
     image = 0.3 + 0.1 * noise(3, 36, 48)
     _, y = sides(36, 48)
     photograph = shaded(image, 0.2, -0.1) * (0.3 * y.square()).exp()
-    whole, even, odd = slopes_of_light(image, photograph, ALL, 16)
+    whole, even, odd = light_slopes(image, photograph, ALL, 16)
     expected = torch.tensor([[0.1, 0.2, 0.2], [-0.1, -0.1, -0.1]], dtype=torch.float64)
     for found in (whole, even, odd):
         torch.testing.assert_close(found, expected, atol=0.02, rtol=0)
     photograph[:, :12] = 0.9  # something in the way, which does not count
-    torch.testing.assert_close(slopes_of_light(image, photograph, ALL & (torch.arange(36) >= 12)[:, None], 16)[0],
+    torch.testing.assert_close(light_slopes(image, photograph, ALL & (torch.arange(36) >= 12)[:, None], 16)[0],
                                expected, atol=0.03, rtol=0)  # fmt: skip
-    assert slopes_of_light(image, photograph, ~ALL, 16).isnan().all()
+    assert light_slopes(image, photograph, ~ALL, 16).isnan().all()
     two_rows = (ALL & (torch.arange(36) >= 24)[:, None]).clone()  # 12 blocks, which tell no slope down beside a bow
-    assert slopes_of_light(image, photograph, two_rows, 16).isnan().all()
-    assert slopes_of_light(image[..., :4, :4], photograph[..., :4, :4], ALL[:4, :4], 16).isnan().all()
+    assert light_slopes(image, photograph, two_rows, 16).isnan().all()
+    assert light_slopes(image[..., :4, :4], photograph[..., :4, :4], ALL[:4, :4], 16).isnan().all()
 
 
 @pytest.mark.parametrize("size", [(36, 48), (35, 47), (41, 53)])
 def test_slopes_are_those_of_the_whole_side(size: tuple[int, int]) -> None:
     """Also where sixths of it are no whole numbers of pixels."""
     image = torch.full((3, *size), 0.4)
-    found = slopes_of_light(image, shaded(image, 0.3, -0.2), torch.ones(size, dtype=torch.bool), 9)[0]
+    found = light_slopes(image, shaded(image, 0.3, -0.2), torch.ones(size, dtype=torch.bool), 9)[0]
     torch.testing.assert_close(found[0], torch.tensor([0.15, 0.3, 0.3], dtype=torch.float64), atol=1e-3, rtol=0)
     torch.testing.assert_close(found[1], torch.full((3,), -0.2, dtype=torch.float64), atol=1e-3, rtol=0)
 
@@ -85,6 +85,16 @@ def test_slopes_are_those_of_the_whole_side(size: tuple[int, int]) -> None:
 def options(**changes: object) -> ExposureOptions:
     """Those of conf, asked for, and changes."""
     return replace(ExposureOptions(when="auto", grid="auto"), **changes)
+
+
+def exposure_of(views: int = 4, iterations: int = 1000, **changes: object) -> Exposure:
+    """The module with these options."""
+    return build_module(Exposure, options(**changes), iterations=iterations, views=views)
+
+
+def measure_of(pairs: list[tuple[Tensor, Tensor, None]], slopes: bool = True) -> Measure:
+    """Measures light by number of a photo."""
+    return lambda index: light_of(pairs[index], slopes)
 
 
 def pairs_of(slopes: list[float]) -> tuple[Tensor, list[tuple[Tensor, Tensor, None]]]:
@@ -96,38 +106,38 @@ def pairs_of(slopes: list[float]) -> tuple[Tensor, list[tuple[Tensor, Tensor, No
 def test_grids_begin_where_light_differs_less_what_all_have_in_common() -> None:
     slopes = [0.3, -0.1, 0.2, -0.2]
     image, pairs = pairs_of(slopes)
-    found = Exposures(options(), list("abcd"), 1000, CPU)
-    _, inside = found.judge(pairs.__getitem__, 201)
+    found = exposure_of()
+    _, inside = found.test(measure_of(pairs), 201)
     across = torch.tensor(slopes).var() * torch.tensor([0.25, 1, 1])  # red half as much; none of them down
     assert inside == pytest.approx(math.sqrt(float(across.sum()) / 6), rel=0.05)
     assert found.grids is not None
     assert not any(found.due(number) for number in range(1, 1001)), "grids are learnt on, and not told again"
-    found.iterations = 6000
+    found.context = replace(found.context, iterations=6000)
     assert not found.due(1201), "nor judged anew where the run goes on longer"
     torch.testing.assert_close(found.grids.detach().mean(0), torch.zeros(RANK, 3, 4), atol=1e-6, rtol=0)
-    for name, slope in zip("abcd", slopes, strict=True):
+    for index, slope in enumerate(slopes):
         wanted = shaded(image, slope - 0.05, 0)
-        assert (found.applied(image, name).detach() - wanted).abs().mean() < 0.2 * (image - wanted).abs().mean()
+        assert (found.expose(image, index).detach() - wanted).abs().mean() < 0.2 * (image - wanted).abs().mean()
 
 
 def test_a_photograph_of_which_nothing_is_told_begins_with_the_mean_light() -> None:
     slopes = torch.tensor([[0.3] * 3, [0.1] * 3])[:, None].repeat(1, 2, 1)
-    found = first_matrices(torch.cat([slopes, torch.full((1, 2, 3), math.nan)]))
+    found = initial_grids(torch.cat([slopes, torch.full((1, 2, 3), math.nan)]))
     assert found[2].abs().max() < 1e-6
     torch.testing.assert_close(found[:2, 1, :, :3], torch.stack([0.1 * torch.eye(3), -0.1 * torch.eye(3)]))
 
 
 def test_even_light_has_no_grids_unless_asked_for() -> None:
     _, pairs = pairs_of([0.03, -0.02, 0.01, 0.0])
-    found = Exposures(options(), list("abcd"), 1000, CPU)
-    assert 0 < found.judge(pairs.__getitem__, 201)[1] < found.options.grid_spread
+    found = exposure_of()
+    assert 0 < found.test(measure_of(pairs), 201)[1] < found.options.grid_spread
     assert found.grids is found.matrices is None
-    assert "grids" not in found.tensors()
-    asked = Exposures(options(grid="always"), list("abcd"), 1000, CPU)
-    asked.judge(pairs.__getitem__, 201)
+    assert "grids" not in found.state_dict()
+    asked = exposure_of(grid="always")
+    asked.test(measure_of(pairs), 201)
     assert asked.grids is not None
-    never = Exposures(options(grid="never"), list("abcd"), 1000, CPU)
-    assert math.isnan(never.judge(pairs_of([0.3, -0.3, 0.2, -0.2])[1].__getitem__, 201)[1])
+    never = exposure_of(grid="never")
+    assert math.isnan(never.test(measure_of(pairs_of([0.3, -0.3, 0.2, -0.2])[1], slopes=False), 201)[1])
     assert never.grids is None
 
 
@@ -141,29 +151,26 @@ def test_a_grid_comes_behind_an_exposure() -> None:
 def test_grids_are_learnt_and_go_on_from_what_was_kept() -> None:
     image = 0.2 + 0.3 * noise(3, 12, 16)
     truth = without_common(0.2 * noise(2, RANK, 3, 4, seed=3))
-    found = Exposures(options(rate_final=0.001), ["a", "b"], 200, CPU)
-    found.begin(torch.eye(3, 4).repeat(2, 1, 1), first_matrices(torch.zeros(2, 2, 3)))
+    found = exposure_of(2, 200, rate_final=0.001)
+    found.start(torch.eye(3, 4).repeat(2, 1, 1), initial_grids(torch.zeros(2, 2, 3)))
 
-    def go_on(exposures: Exposures, first: int, last: int) -> float:
-        for number in range(first, last):
-            name = "ab"[number % 2]
-            loss = (
-                exposures.applied(image, name, learning=True) - through_grid(image, truth["ab".index(name)])
-            ).square()
+    def go_on(module: Exposure, first: int, last: int) -> float:
+        for step in range(first, last):
+            loss = (module.expose(image, step % 2, learning=True) - apply_grid(image, truth[step % 2])).square()
             loss.mean().backward()
-            exposures.update(number)
+            module.optimizer_step(step)
         return float(loss.detach().mean())
 
     before = go_on(found, 41, 43)
     go_on(found, 43, 90)
-    other = Exposures(options(rate_final=0.001), ["a", "b"], 200, CPU)
-    other.restore({name: value.clone() for name, value in found.tensors().items()})
+    other = exposure_of(2, 200, rate_final=0.001)
+    other.load_state_dict({name: value.clone() for name, value in found.state_dict().items()})
     assert go_on(found, 90, 200) == go_on(other, 90, 200) < before / 10
     assert found.grids is not None
     assert other.grids is not None
     assert torch.equal(found.grids, other.grids)
     torch.testing.assert_close(found.grids.detach().mean(0), torch.zeros(RANK, 3, 4), atol=1e-6, rtol=0)
-    assert not found.applied(image, "a").requires_grad
+    assert not found.expose(image, 0).requires_grad
 
 
 SHADED = (
@@ -175,7 +182,7 @@ SHADED = (
 
 def test_a_run_with_grids_resumes_as_if_never_stopped(tmp_path: Path) -> None:
     whole = tiny_run(tmp_path / "whole", SHADED)
-    assert whole.exposures.grids is not None
+    assert whole.modules["exposure"].grids is not None
     stopped_at(tmp_path / "stopped", SHADED, 9)
     a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()

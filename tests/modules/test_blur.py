@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from module_contexts import build_module
 from small_scene import Grey, small_scene, spread
 from tiny import final_tensors, tiny_run
 from torch import Tensor
@@ -16,7 +17,6 @@ from gsx.core.data.scene import View
 from gsx.core.quality.sharpness import fineness
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import view_loss
-from gsx.experiments.evaluation.remarks import gathered, remarks_of
 from gsx.experiments.runs.degraded import pair_of
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.halves import made
@@ -29,7 +29,12 @@ LONG, SHORT, IDLE = Movement(3.0, 4.0, 0.2), Movement(0.5, 0.5, 0.2), Movement(3
 
 
 def blur(when: str = "auto", **more: float) -> Blur:
-    return Blur(BlurOptions(when=when, start=0.1, until=0.4, times=3, **more), 1000)
+    return build_module(Blur, BlurOptions(when=when, start=0.1, until=0.4, times=3, **more))
+
+
+def blurred(module: Blur, image: Tensor, view: View) -> Tensor:
+    """A render as its photo would show it."""
+    return module.transform_render(image, view, None, None, learning=False)
 
 
 def views(count: int = 4) -> list[View]:
@@ -72,34 +77,34 @@ def noisy(blurred: int) -> list[View]:
 
 def test_suspects_are_less_sharp_than_their_neighbours_and_then_all() -> None:
     photographs, own = noisy(blurred=3), blur()
-    assert [view.name for view in own.suspects(photographs)] == ["view3"]
-    assert [view.name for view in own.suspects(photographs * 4)] == ["view3"]
-    assert blur(sharpness=0.0).suspects(photographs) == []
-    assert blur("always").suspects(photographs) == photographs
+    assert [view.name for view in own.candidates(photographs)] == ["view3"]
+    assert [view.name for view in own.candidates(photographs * 4)] == ["view3"]
+    assert blur(sharpness=0.0).candidates(photographs) == []
+    assert blur("always").candidates(photographs) == photographs
     own.move({photographs[3]: LONG}, 101)
-    assert own.suspects(photographs) == photographs
+    assert own.candidates(photographs) == photographs
 
 
 def test_renders_move_by_as_much_as_their_photographs_at_any_size() -> None:
     own, [view, other] = blur(), views(2)
     own.move({view: LONG}, 101)
     image = torch.rand(3, 16, 24, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(own.applied(image, view), motion_blurred(image, 3.0, 4.0))
-    assert own.applied(image, other) is image
+    assert torch.equal(blurred(own, image, view), motion_blurred(image, 3.0, 4.0))
+    assert blurred(own, image, other) is image
     finer, smaller = (replace(view, camera=view.camera.resize(*size)) for size in ((48, 32), (12, 8)))
-    assert torch.equal(own.applied(image, finer), motion_blurred(image, 6.0, 8.0))
-    assert torch.equal(own.applied(image, smaller), motion_blurred(image, 1.5, 2.0))
+    assert torch.equal(blurred(own, image, finer), motion_blurred(image, 6.0, 8.0))
+    assert torch.equal(blurred(own, image, smaller), motion_blurred(image, 1.5, 2.0))
     part = replace(finer, camera=finer.camera.crop(0, 0, 24, 16))
-    assert torch.equal(own.applied(image, part), motion_blurred(image, 6.0, 8.0))
+    assert torch.equal(blurred(own, image, part), motion_blurred(image, 6.0, 8.0))
 
 
 def test_they_go_on_from_what_was_kept() -> None:
     own, again = blur(), blur()
     own.move(dict.fromkeys([views()[1], replace(views()[0], name="of a b")], LONG), 201)
-    again.restore(own.tensors())
-    assert (again.movements, again.asked) == (own.movements, 201)
-    again.restore({})
-    assert (again.movements, again.asked) == ({}, 0)
+    again.load_state_dict(own.state_dict())
+    assert (again.movements, again.last_estimate) == (own.movements, 201)
+    again.load_state_dict({})
+    assert (again.movements, again.last_estimate) == ({}, 0)
 
 
 @pytest.mark.parametrize(("key", "value"), [("when", "maybe"), ("start", 0.0), ("until", 0.05)])
@@ -129,12 +134,14 @@ def moved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Path]:
 def test_a_run_finds_how_its_cameras_moved(moved: tuple[Run, Path]) -> None:
     run, _ = moved
     told = [line for line in run.curves if "blur_seconds" in line]
-    assert [line["step"] for line in told] == run.blur.steps()
-    assert f"moved in {len(run.blur.movements)} training photographs" in " ".join(remarks_of(gathered(run.curves)))
+    assert [line["step"] for line in told] == run.modules["blur"].steps()
+    module = run.modules["blur"]
+    remarks = " ".join(module.remarks(module.summary(run.curves)))
+    assert f"moved in {len(module.movements)} training photos" in remarks
     size, far = torch.tensor([80.0, 64.0], dtype=torch.float64), 0
     for view in run.scene.train:
         made = torch.tensor(pair_of("blur", view.name, 8.0), dtype=torch.float64)
-        found = size * torch.tensor(run.blur.movements.get(view.name, (0.0, 0.0)), dtype=torch.float64)
+        found = size * torch.tensor(run.modules["blur"].movements.get(view.name, (0.0, 0.0)), dtype=torch.float64)
         far += min(float((found - sign * made).norm()) for sign in (1, -1)) > 0.25 * float(made.norm()) + 1
     assert far <= 1
 
@@ -144,7 +151,7 @@ def test_a_run_resumes_as_if_never_stopped_and_learns_by_what_was_found(tmp_path
     assert [line["step"] for line in whole.curves if "blur_seconds" in line] == [7, 9, 11]
     tiny_run(tmp_path / "stopped", SHORTER, stop_after=8)
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
-    assert run.blur.movements
+    assert run.modules["blur"].movements
     execute(run, settings, plugins())
     a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()
@@ -155,11 +162,11 @@ def test_a_run_resumes_as_if_never_stopped_and_learns_by_what_was_found(tmp_path
 def test_renders_are_blurred_before_they_are_compared(moved: tuple[Run, Path]) -> None:
     """A sharp model is nearer to blurred photographs so."""
     run, _ = open_run(moved[1], plugins())
-    found = dict(run.blur.movements)
+    found = dict(run.modules["blur"].movements)
     view = max(run.train_views, key=lambda view: math.hypot(*found.get(view.name, (0.0, 0.0))))
     losses = []
     for movements in (found, {}):
-        run.blur.movements = movements
+        run.modules["blur"].movements = movements
         losses.append(float(view_loss(run, run.step, view, [], run.scene.background).loss))
     assert losses[0] < 0.8 * losses[1]
 
@@ -169,8 +176,8 @@ def test_halves_take_the_movements_that_were_found(moved: tuple[Run, Path]) -> N
     pictures = []
     for known in (True, False):
         run, _ = open_run(moved[1], plugins())
-        name = next(iter(run.blur.movements))
-        run.blur.movements = run.blur.movements if known else {}
+        name = next(iter(run.modules["blur"].movements))
+        run.modules["blur"].movements = run.modules["blur"].movements if known else {}
         shown = made(run, lambda scene, steps, generator, resolution, own=run.backbone: own, 1, 0)
         pictures.append(next(shown[n] for n, view in enumerate(run.train_views) if view.name == name))
     assert fineness(pictures[0]).min() < 0.9 * fineness(pictures[1]).min()
@@ -180,7 +187,7 @@ def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path
     plain = tiny_run(tmp_path / "plain", [*SIZE, "iterations=6"])
     words = ["training.blur.when=auto", "training.blur.sharpness=10", "training.blur.explained=0.5"]
     judged = tiny_run(tmp_path / "judged", [*SIZE, "iterations=6", *words])
-    assert not plain.blur.movements
+    assert not plain.modules["blur"].active
     assert [line["blurred"] for line in judged.curves if "blur_seconds" in line] == [0]
     assert [line["blur_suspects"] for line in judged.curves if "blur_seconds" in line] == [6]
     a, b = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "judged")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from module_contexts import build_module
 from small_scene import Grey, small_scene, spread
 from tiny import final_tensors, tiny_run
 from torch import Tensor
@@ -15,12 +16,25 @@ from gsx.core.data.coarser import coarser
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import View
 from gsx.core.errors import Stopped
-from gsx.experiments.evaluation.remarks import gathered, remarks_of
 from gsx.experiments.runs.degraded import patch_of
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
-from gsx.modules.captures import differences, forget, judge_distractors, showing_distractors
-from gsx.modules.distractors import DistractorOptions, Distractors, MaskedSource, mask_view, without_marked
+from gsx.modules.distractors import (
+    DistractorOptions,
+    Distractors,
+    MaskedSource,
+    mask_view,
+    mask_views,
+    measure_differences,
+    remove_rows,
+    rows_of_distractors,
+)
+from gsx.modules.poses import PoseOptions, Poses
+
+
+def distractors(**options: object) -> Distractors:
+    """Of a run of 1,000 steps."""
+    return build_module(Distractors, DistractorOptions(**options))
 
 
 def views(count: int = 4) -> list[View]:
@@ -36,17 +50,11 @@ def marks(count: int = 4) -> list[Tensor]:
 
 
 def test_they_are_judged_once_and_found_again_only_where_there_are_any() -> None:
-    own = Distractors(DistractorOptions(when="auto", start=0.1, until=0.4, times=3), 1000)
+    own = distractors(when="auto", start=0.1, until=0.4, times=3)
     assert [number for number in range(1, 1001) if own.due(number)] == [101]
-    own.mark(marks(), 101)
+    own.mask(marks(), 101)
     assert [number for number in range(1, 1001) if own.due(number)] == [201, 401]
-    assert not any(Distractors(DistractorOptions(), 1000).due(number) for number in range(1, 1001))
-
-
-def test_auto_asks_for_more_than_the_share_and_always_for_nothing() -> None:
-    auto, always = (Distractors(DistractorOptions(when=when, share=0.03), 10) for when in ("auto", "always"))
-    assert [auto.needed(value) for value in (0.02, 0.04)] == [False, True]
-    assert always.needed(0.0)
+    assert not any(distractors().due(number) for number in range(1, 1001))
 
 
 # -- pixels ----------------------------------------------------------------------------------------------------------
@@ -117,25 +125,25 @@ class HalfMasked(Grey):
 def test_masks_of_the_scene_hold_beside_them() -> None:
     source, marked = HalfMasked(), torch.zeros(4, 6, dtype=torch.bool)
     marked[0] = True
-    counted = MaskedSource(source=source, marked=marked, size=(24, 16)).counted(views()[0].camera)
+    counted = MaskedSource(source=source, masked=marked, size=(24, 16)).counted(views()[0].camera)
     expected = torch.zeros(16, 24, dtype=torch.bool)
     expected[4:, 12:] = True
     assert torch.equal(counted, expected)
 
 
 def test_views_are_the_same_until_others_are_found() -> None:
-    own, given = Distractors(DistractorOptions(), 10), views()
-    assert own.views(given) is given
-    assert own.mark(marks(), 5) == pytest.approx(2 / 24 / 4)
-    made = own.views(given)
-    assert own.views(given) is made
+    own, given = distractors(), views()
+    assert own.transform_views(given, None) is given
+    assert own.mask(marks(), 5) == pytest.approx(2 / 24 / 4)
+    made = own.transform_views(given, None)
+    assert own.transform_views(given, None) is made
     assert made[1] is given[1]
-    again = Distractors(DistractorOptions(), 10)
-    again.restore(own.tensors())
-    assert again.looked == 5
-    assert torch.equal(again.views(given)[0].counted(), made[0].counted())
-    own.restore({})
-    assert own.views(given) is given
+    again = distractors()
+    again.load_state_dict(own.state_dict())
+    assert again.last_estimate == 5
+    assert torch.equal(again.transform_views(given, 3)[0].counted(), made[0].counted())
+    own.load_state_dict({})
+    assert own.transform_views(given, None) is given
 
 
 # -- runs ------------------------------------------------------------------------------------------------------------
@@ -159,14 +167,14 @@ def test_a_run_resumes_as_if_never_stopped_and_leaves_out_what_covers_its_photog
     whole = tiny_run(tmp_path / "whole", BEFORE_IT)
     tiny_run(tmp_path / "stopped", BEFORE_IT, stop_after=26)
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
-    assert run.distractors.marked is not None
+    assert run.modules["distractors"].active
     execute(run, settings, plugins())
     a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()
     assert "distractors.0" in a
     assert all(torch.equal(a[name], b[name]) for name in a)
     told = [line for line in whole.curves if "distractor_seconds" in line]
-    assert [line["step"] for line in told] == run.distractors.steps()
+    assert [line["step"] for line in told] == run.modules["distractors"].milestones()
     assert sum(line["forgotten"] for line in told) > 0
     found, covered, others = 0, 0, 0
     for view, own in zip(whole.train_views, whole.scene.train, strict=True):
@@ -182,10 +190,12 @@ def test_a_run_resumes_as_if_never_stopped_and_leaves_out_what_covers_its_photog
 
 def test_a_stop_between_finding_and_the_step_is_told_as_far_as_it_is_known() -> None:
     lines = [{"step": 7, "distractors": 0.05, "distractor_seconds": 1.0}, {"step": 9, "loss": 1.0}]
-    assert gathered(lines)["distractors"] == {"step": 7, "share": None, "marked": [0.05], "seconds": 1.0}
-    assert "5.0% of the pixels" in " ".join(remarks_of(gathered(lines)))
-    poses = gathered([{"step": 7, "poses": 6, "pose_motion": 0.2, "pose_seconds": 1.0}])
-    assert "corrected" in " ".join(remarks_of(poses))
+    module, poses = distractors(), build_module(Poses, PoseOptions())
+    summary = module.summary(lines)
+    assert summary == {"distractors": {"step": 7, "share": None, "marked": [0.05], "seconds": 1.0}}
+    assert "5.0% of the pixels" in " ".join(module.remarks(summary))
+    summary = poses.summary([{"step": 7, "poses": 6, "pose_motion": 0.2, "pose_seconds": 1.0}])
+    assert "corrected" in " ".join(poses.remarks(summary))
 
 
 def test_renders_are_blurred_at_the_size_that_they_are_compared_at(
@@ -197,12 +207,12 @@ def test_renders_are_blurred_at_the_size_that_they_are_compared_at(
         list[tuple[object, ...]](),
     )
 
-    def applied(image: Tensor, view: View) -> Tensor:
+    def applied(image: Tensor, view: View, *rest: object) -> Tensor:
         seen.append(((image.shape[2], image.shape[1]), view.camera.size))
         return image
 
-    monkeypatch.setattr(run.blur, "applied", applied)
-    differences(run, run.scene.train[:2])
+    monkeypatch.setattr(run.modules["blur"], "transform_render", applied)
+    measure_differences(run, run.scene.train[:2])
     assert len(seen) == 2
     assert all(rendered == size for rendered, size in seen)
 
@@ -212,8 +222,8 @@ def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path
     plain = tiny_run(tmp_path / "plain", short)
     asked = ["training.distractors.when=auto", "training.distractors.share=0.9"]
     judged = tiny_run(tmp_path / "judged", [*short, *asked])
-    assert plain.distractors.marked is None
-    assert judged.distractors.marked is None
+    assert not plain.modules["distractors"].active
+    assert not judged.modules["distractors"].active
     assert [line["distractors"] for line in judged.curves if "distractor_share" in line] == [0]
     a, b = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "judged")
     assert a.keys() == b.keys()
@@ -226,7 +236,7 @@ def test_primitives_that_show_what_does_not_count_are_removed_and_no_others(tmp_
     blocks = [torch.zeros(9, 12, dtype=torch.bool) for _ in run.scene.train]
     blocks[0][:, :6] = True
     before = run.backbone.table["means"].clone()
-    gone = forget(run, showing_distractors(run, without_marked(run.scene.train, blocks)))
+    gone = remove_rows(run, rows_of_distractors(run, mask_views(run.scene.train, blocks)))
     left = {tuple(mean) for mean in run.backbone.table["means"].tolist()}
     removed = torch.tensor([mean for mean in before.tolist() if tuple(mean) not in left])
     assert 0 < gone == len(removed) < len(before) / 4
@@ -234,8 +244,8 @@ def test_primitives_that_show_what_does_not_count_are_removed_and_no_others(tmp_
     assert float(sees.float().mean()) < 3  # of six: others would show them where they count
     pixels, _ = run.scene.train[0].camera.project(removed)
     assert float((pixels[:, 0] < 24).float().mean()) > 0.9
-    nothing = without_marked(run.scene.train, [torch.ones_like(one) for one in blocks])
-    assert forget(run, showing_distractors(run, nothing)) == 0  # a model of nothing is none
+    nothing = mask_views(run.scene.train, [torch.ones_like(one) for one in blocks])
+    assert remove_rows(run, rows_of_distractors(run, nothing)) == 0  # a model of nothing is none
 
 
 def test_a_stop_while_distractors_are_found_leaves_all_to_be_found_again(
@@ -243,14 +253,15 @@ def test_a_stop_while_distractors_are_found_leaves_all_to_be_found_again(
 ) -> None:
     """Marks without what they tell to remove would stay so."""
     run = tiny_run(tmp_path, ["iterations=4", "eval.zoom=[1]", "training.distractors.when=always"])
-    before = run.distractors.marked, run.distractors.looked
+    module = run.modules["distractors"]
+    before = module.masks, module.last_estimate
 
     def stop(*_: object) -> None:
         raise Stopped
 
     blocks = [torch.ones(9, 12, dtype=torch.bool) for _ in run.scene.train]
-    monkeypatch.setattr("gsx.modules.captures.distractors_in", lambda _: blocks)
-    monkeypatch.setattr("gsx.modules.captures.shown_weights", stop)
+    monkeypatch.setattr("gsx.modules.distractors.distractors_in", lambda _: blocks)
+    monkeypatch.setattr("gsx.modules.distractors.Probe", stop)
     with pytest.raises(Stopped):
-        judge_distractors(run)
-    assert (run.distractors.marked, run.distractors.looked) == before
+        module.estimate(run, module.milestones()[0])
+    assert (module.masks, module.last_estimate) == before

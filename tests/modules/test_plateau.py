@@ -5,9 +5,11 @@ import math
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
+from module_contexts import build_module
 from small_scene import small_scene, spread
 from tiny import final_tensors, stopped_at, tiny_run, tiny_settings
 from torch import Tensor
@@ -44,14 +46,20 @@ def steps_of(folder: Path) -> list[int]:
     return [json.loads(line)["step"] for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
-def plateau_of(price: float, passing: int, **more: int) -> Plateau:
-    return Plateau(PlateauOptions(price=price), iterations=1000, passing=passing, **more)
+def plateau_of(price: float, views: int, iterations: int = 1000) -> Plateau:
+    return build_module(Plateau, PlateauOptions(price=price), iterations=iterations, views=views)
 
 
-def begun(price: float, before: list[float], step: int = 500) -> Plateau:
+def run_with(*milestones: int) -> SimpleNamespace:
+    """A run in which something else happens once before these steps."""
+    other = SimpleNamespace(milestones=lambda: milestones)
+    return SimpleNamespace(backbone=None, modules={"other": other})
+
+
+def started(price: float, before: list[float], step: int = 500) -> Plateau:
     """125 views; windows began with these errors."""
     plateau = plateau_of(price, 125)
-    plateau.begin(step, torch.tensor(before, dtype=torch.float64))
+    plateau.start_test(step, torch.tensor(before, dtype=torch.float64))
     return plateau
 
 
@@ -62,48 +70,47 @@ def windows_of(*sides: int) -> dict[View, Window]:
 
 def test_when_steps_are_judged() -> None:
     """A tenth of the steps so far or a pass over the views, whatever is more; while there are steps to leave out."""
-    plateau = plateau_of(1.0, 52)
-    assert [step for step in range(1000) if plateau.begins_after(step)] == [500]
-    plateau.begin(500, torch.zeros(1))
-    assert [step for step in range(1000) if plateau.judged_after(step)] == [552]
-    assert plateau.begins_after(552)
-    plateau.begin(700, torch.zeros(1))
-    assert [step for step in range(1000) if plateau.judged_after(step)] == [770]
-    assert not plateau.begins_after(770)  # its windows would be judged after step 847
-    assert not any(plateau_of(0.0, 52).begins_after(step) for step in range(1000))
+    plateau, run = plateau_of(1.0, 52), run_with()
+    assert [step for step in range(1000) if plateau.test_starts_after(run, step)] == [500]
+    plateau.start_test(500, torch.zeros(1))
+    assert [step for step in range(1000) if plateau.test_ends_after(run, step)] == [552]
+    assert plateau.test_starts_after(run, 552)
+    plateau.start_test(700, torch.zeros(1))
+    assert [step for step in range(1000) if plateau.test_ends_after(run, step)] == [770]
+    assert not plateau.test_starts_after(run, 770)  # its windows would be judged after step 847
+    assert not any(plateau_of(0.0, 52).test_starts_after(run, step) for step in range(1000))
 
 
 def test_nothing_that_is_due_once_is_left_out() -> None:
-    plateau = plateau_of(1.0, 52, settled=625)
-    assert [step for step in range(1000) if plateau.begins_after(step)] == [625]
+    plateau, run = plateau_of(1.0, 52), run_with(625)
+    assert [step for step in range(1000) if plateau.test_starts_after(run, step)] == [625]
 
 
 def test_windows_of_another_schedule_are_not_judged() -> None:
     """The run has become longer since: they began before density control ends now."""
-    plateau = plateau_of(1.0, 52)
-    plateau.begin(500, torch.zeros(1))
-    plateau.iterations = 2000
-    assert not any(plateau.judged_after(step) for step in range(2000))
-    assert [step for step in range(2000) if plateau.begins_after(step)] == [1000]
+    plateau, run = plateau_of(1.0, 52, iterations=2000), run_with()
+    plateau.start_test(500, torch.zeros(1))
+    assert not any(plateau.test_ends_after(run, step) for step in range(2000))
+    assert [step for step in range(2000) if plateau.test_starts_after(run, step)] == [1000]
 
 
 @pytest.mark.parametrize(("price", "left_out"), [(9.5, range(626, 800)), (9.0, range(0))])
 def test_gain_by_hand(price: float, left_out: range) -> None:
     """Half the error by a quarter more steps: 3.01 dB by 0.32 doublings, 9.35 dB a doubling."""
-    plateau = begun(price, [6e6, 2e6])
-    plateau.judge(windows_of(10, 10), torch.tensor([3e6, 1e6], dtype=torch.float64), 625)
-    assert plateau.found[0, :2].tolist() == pytest.approx([625, 10 * math.log10(2) / math.log2(1.25)])
-    assert plateau.left_out == left_out
-    told = {"step_gain": float(plateau.found[0, 1]), "step_price": price}
-    assert plateau.told_at(626) == told
-    assert plateau.told_at(800) == (told | {"steps_left_out": 174} if left_out else {})
-    assert plateau.told_at(627) == {}
+    plateau = started(price, [6e6, 2e6])
+    plateau.finish_test(windows_of(10, 10), torch.tensor([3e6, 1e6], dtype=torch.float64), 625)
+    assert plateau.gains[0, :2].tolist() == pytest.approx([625, 10 * math.log10(2) / math.log2(1.25)])
+    assert plateau.skipped == left_out
+    told = {"step_gain": float(plateau.gains[0, 1]), "step_price": price}
+    assert plateau.metrics_at(626) == told
+    assert plateau.metrics_at(800) == (told | {"steps_left_out": 174} if left_out else {})
+    assert plateau.metrics_at(627) == {}
 
 
 def test_errors_below_the_rounding_of_photographs_are_no_gain() -> None:
-    plateau = begun(0.1, [1e-9])
-    plateau.judge(windows_of(16), torch.tensor([1e-12], dtype=torch.float64), 625)
-    assert plateau.left_out
+    plateau = started(0.1, [1e-9])
+    plateau.finish_test(windows_of(16), torch.tensor([1e-12], dtype=torch.float64), 625)
+    assert plateau.skipped
 
 
 def test_rounding_counts_where_pixels_do(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,11 +125,11 @@ def test_rounding_counts_where_pixels_do(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_masked_windows_leave_no_step_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """They are not judged, and others take their place."""
     monkeypatch.setattr(View, "counted", lambda view: torch.zeros(*reversed(view.camera.size), dtype=torch.bool))
-    plateau = begun(9.5, [0.0, 0.0])
-    plateau.judge(windows_of(10, 10), torch.zeros(2, dtype=torch.float64), 625)
-    assert not plateau.left_out
-    assert not len(plateau.found)
-    assert not plateau.open
+    plateau = started(9.5, [0.0, 0.0])
+    plateau.finish_test(windows_of(10, 10), torch.zeros(2, dtype=torch.float64), 625)
+    assert not plateau.skipped
+    assert not len(plateau.gains)
+    assert not plateau.testing(run_with())
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +142,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Path]:
 def test_steps_that_gain_too_little_are_left_out(whole: tuple[Run, Path]) -> None:
     run, folder = whole
     assert steps_of(folder) == [*range(1, 17), *range(32, 41)]
-    assert run.plateau.found[:, 0].tolist() == [16]
+    assert run.modules["plateau"].gains[:, 0].tolist() == [16]
     assert run.curves[16]["steps_left_out"] == 15
 
 
@@ -147,15 +154,15 @@ def test_steps_that_gain_too_little_are_left_out(whole: tuple[Run, Path]) -> Non
         (("backbone.density.stop=6000", "backbone.sh_judged=0.7"), 28),
         (("backbone.density.stop=6000", "backbone.sh_judged=0.8"), 10),  # done with the first step that is taken again
         (("backbone.density.stop=6000", "training.exposure.when=always", "training.exposure.until=0.5"), 21),
-        (("backbone.density.stop=6000", "training.supersample=2", "training.supersample_from=0.6"), 24),
-        (("backbone.density.stop=6000", "training.coarse=2", "training.coarse_until=0.3"), 12),
+        (("backbone.density.stop=6000", "training.supersampling.factor=2", "training.supersampling.start=0.6"), 24),
+        (("backbone.density.stop=6000", "training.coarse_to_fine.factor=2", "training.coarse_to_fine.until=0.3"), 12),
     ],
 )
 def test_steps_are_judged_when_all_else_is_settled(more: tuple[str, ...], first: int, tmp_path: Path) -> None:
     words = [word for word in WORDS if not word.startswith("backbone.density")]
     settings = tiny_settings(tmp_path, *words, "training.plateau.price=1", *more)
     run = build(settings, load_scene(settings), tmp_path, training=True)
-    assert run.plateau.first == first
+    assert run.modules["plateau"].first_test(run) == first
 
 
 @pytest.fixture
@@ -188,14 +195,14 @@ def test_every_step_is_taken_that_gains_enough(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr("gsx.modules.plateau.decibels", lambda has, had: (1.0, 0.0))
     run = tiny_run(tmp_path / "run", (*WORDS, "training.plateau.price=0.1"))
     assert steps_of(tmp_path / "run") == list(range(1, 41))
-    assert run.plateau.found[:, 0].tolist() == [16, 22, 28]
+    assert run.modules["plateau"].gains[:, 0].tolist() == [16, 22, 28]
 
 
 def test_training_does_not_see_the_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Photographs white in them train to the same bits as long as they stay; where they are seen again, to others."""
     words, photograph = (*WORDS, "training.plateau.price=1e-6"), Photographs.of
     plain = tiny_run(tmp_path / "plain", words, stop_after=16)
-    own = {view.name: window for view, window in plain.plateau.windows(plain.scene.train, 10).items()}
+    own = {view.name: window for view, window in plain.modules["plateau"].windows(plain.scene.train, 10).items()}
     assert len(own) == 6
     taken = list[int]()
 
@@ -224,7 +231,7 @@ def test_pseudo_details_do_not_show_the_windows(tmp_path: Path, seen: list[Pseud
     more = ("augmenter=upscale", "regenerator/upscale=lanczos", "augmenter.upscale.scales=[1,2]", *timing)
     run = tiny_run(tmp_path, (*WORDS, "training.plateau.price=1e-6", *more), stop_after=15)
     before, since = seen[: 2 * 2], seen[2 * 2 :]  # steps 9 and 10, two scales each
-    windows = list(run.plateau.windows(run.scene.train, 10).items())
+    windows = list(run.modules["plateau"].windows(run.scene.train, 10).items())
     assert all(view.pixel_weight is None for view in before)
     hidden = Counter[int]()
     for pseudo in since:

@@ -8,6 +8,7 @@ from unittest.mock import patch
 
 import pytest
 import torch
+from module_contexts import build_module
 from small_scene import small_scene, spread
 from tiny import final_tensors, tiny_run, tiny_settings
 from torch import Tensor
@@ -23,23 +24,28 @@ from gsx.experiments.runs.build import build
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
-from gsx.modules import captures
+from gsx.modules import poses as poses_module
 from gsx.modules.alignment import Motion, moved, rotation_by
-from gsx.modules.captures import judge_photographs
 from gsx.modules.distractors import DistractorOptions
+from gsx.modules.photo_pairs import render_reduced
 from gsx.modules.pinned import Taken, posed
 from gsx.modules.poses import (
     PoseOptions,
     Poses,
+    half_shifts,
     in_moved_world,
-    in_px,
-    shifts_by_half,
-    spread_of_shifts,
+    motion_px,
+    shift_spread,
     usual_shift,
     without_common,
 )
 
 DEPTH = 4.0
+
+
+def poses_of(options: PoseOptions, iterations: int = 1000) -> Poses:
+    """Poses of eight photos."""
+    return build_module(Poses, options, iterations=iterations, views=8)
 
 
 def numbers(*shape: int, seed: int = 0) -> Tensor:
@@ -63,19 +69,19 @@ def nudged(camera: Camera, twist: Tensor) -> Camera:
 
 
 def test_corrections_are_early_and_then_ever_rarer() -> None:
-    poses = Poses(PoseOptions(when="auto", start=0.1, until=0.8, times=4), cameras(), 1000)
-    assert poses.steps() == [101, 201, 401, 801]
+    poses = poses_of(PoseOptions(when="auto", start=0.1, until=0.8, times=4))
+    assert poses.milestones() == [101, 201, 401, 801]
     assert [number for number in range(1, 1001) if poses.due(number)] == [101]
     poses.take(torch.zeros(8, 3, 4, dtype=torch.float64))
     assert [number for number in range(1, 1001) if poses.due(number)] == [101, 201, 401, 801]
-    assert not any(Poses(PoseOptions(), cameras(), 1000).due(number) for number in range(1, 1001))
-    assert Poses(PoseOptions(when="auto", times=1), cameras(), 10).steps() == [3]
+    assert not any(poses_of(PoseOptions()).due(number) for number in range(1, 1001))
+    assert poses_of(PoseOptions(when="auto", times=1), 10).milestones() == [3]
 
 
-def test_auto_asks_for_more_than_the_threshold_and_always_for_nothing() -> None:
-    auto, always = (Poses(PoseOptions(when=when, spread=0.3), cameras(), 10) for when in ("auto", "always"))
-    assert [auto.needed(value) for value in (0.2, 0.4)] == [False, True]
-    assert always.needed(0.0)
+def test_auto_corrects_above_the_threshold_and_always_in_any_case() -> None:
+    auto, always = (poses_of(PoseOptions(when=when, spread=0.3), 10) for when in ("auto", "always"))
+    assert [auto.wrong(value, 3) for value in (0.2, 0.4)] == [False, True]
+    assert always.wrong(0.0, 3)
 
 
 def errors_expected(poses: Poses, usual: float, steps: Sequence[int]) -> list[float]:
@@ -83,23 +89,24 @@ def errors_expected(poses: Poses, usual: float, steps: Sequence[int]) -> list[fl
     out = []
     for number in steps:
         out.append(poses.expected_error(number, usual))
-        poses.correct(poses.cameras, poses.cameras, DEPTH, number, out[-1])
+        still = [view.camera for view in poses.context.scene.train]
+        poses.correct(still, still, DEPTH, number, out[-1])
     return out
 
 
 def test_poses_are_held_ever_more_firmly_also_where_a_run_goes_on_longer() -> None:
     options = PoseOptions(when="auto", start=0.1, until=0.8, times=4)
     for usual, wanted in ((4.0, [4, 2, 1, 0.5]), (0.1, [0.5] * 4), (math.nan, [0.5] * 4)):
-        poses = Poses(options, cameras(), 1000)
-        assert errors_expected(poses, usual, poses.steps()) == pytest.approx(wanted)
-    poses = Poses(options, cameras(), 1000)
-    assert errors_expected(poses, 4.0, poses.steps()[:3]) == pytest.approx([4, 2, 1])
-    longer = Poses(options, cameras(), 10_000)
-    longer.restore(poses.tensors())
-    assert errors_expected(longer, math.nan, longer.steps()) == pytest.approx([0.5 * 2**share for share in
+        poses = poses_of(options)
+        assert errors_expected(poses, usual, poses.milestones()) == pytest.approx(wanted)
+    poses = poses_of(options)
+    assert errors_expected(poses, 4.0, poses.milestones()[:3]) == pytest.approx([4, 2, 1])
+    longer = poses_of(options, 10_000)
+    longer.load_state_dict(poses.state_dict())
+    assert errors_expected(longer, math.nan, longer.milestones()) == pytest.approx([0.5 * 2**share for share in
                                                                              (3 / 4, 1 / 2, 1 / 4, 0)])  # fmt: skip
-    once = Poses(PoseOptions(when="auto", times=1), cameras(), 1000)
-    assert errors_expected(once, 4.0, once.steps()) == [4.0]
+    once = poses_of(PoseOptions(when="auto", times=1))
+    assert errors_expected(once, 4.0, once.milestones()) == [4.0]
 
 
 @pytest.mark.parametrize("options", [PoseOptions, DistractorOptions])
@@ -124,7 +131,7 @@ def waves(across: float, down: float) -> Tensor:
 
 def spread_between(pictures: Iterable[tuple[Tensor, Tensor, None, float]]) -> float:
     """The spread of shifts of pictures."""
-    return spread_of_shifts(shifts_by_half(pictures))
+    return shift_spread(half_shifts(pictures))
 
 
 def test_the_spread_of_shifts_is_that_of_poses() -> None:
@@ -147,7 +154,7 @@ def test_a_usual_shift_is_that_of_most_photographs() -> None:
     noisy[:20] = 40.0
     noisy[20:30] = math.nan
     assert usual_shift(noisy) == pytest.approx(0.8, rel=0.2)
-    assert spread_of_shifts(noisy) > 5
+    assert shift_spread(noisy) > 5
     assert usual_shift(torch.full((4, 2, 2), math.nan)) == 0
 
 
@@ -160,7 +167,7 @@ def test_a_motion_in_px_is_what_pictures_move_by() -> None:
     turn, move = nudged(camera, torch.tensor([0, 1e-3, 0, 0, 0, 0]).double()), torch.zeros(6).double()
     move[3] = 1e-3
     for other, index in ((turn, 1), (nudged(camera, move), 3)):
-        told = in_px(camera, other, DEPTH)
+        told = motion_px(camera, other, DEPTH)
         seen = (other.project(point[None])[0] - camera.project(point[None])[0])[0]
         assert float(told[index]) == pytest.approx(float(seen[0]), rel=1e-3)
         assert float(told.norm()) == pytest.approx(abs(float(told[index])))
@@ -171,15 +178,15 @@ def test_a_motion_of_the_world_is_taken_back_and_those_of_single_cameras_are_kep
                                      move=torch.tensor([0.02, 0.01, -0.03]).double())  # fmt: skip
     back = without_common(given, [in_moved_world(camera, world) for camera in given], DEPTH)
     for one, other in zip(back, given, strict=True):
-        assert float(in_px(other, one, DEPTH).norm()) < 0.02  # of some 0.6 px: the world's motion is not small
+        assert float(motion_px(other, one, DEPTH).norm()) < 0.02  # of some 0.6 px: the world's motion is not small
     twists = 1e-3 * numbers(8, 6, seed=1)
     own = [nudged(camera, twist) for camera, twist in zip(given, twists, strict=True)]
     kept = without_common(given, own, DEPTH)
     again = without_common(given, kept, DEPTH)
     for one, other in zip(again, kept, strict=True):  # nothing in common is left
-        assert float(in_px(other, one, DEPTH).norm()) < 1e-3
-    shares = [float(in_px(a, b, DEPTH).square().sum()) for a, b in zip(given, kept, strict=True)]
-    before = [float(in_px(a, b, DEPTH).square().sum()) for a, b in zip(given, own, strict=True)]
+        assert float(motion_px(other, one, DEPTH).norm()) < 1e-3
+    shares = [float(motion_px(a, b, DEPTH).square().sum()) for a, b in zip(given, kept, strict=True)]
+    before = [float(motion_px(a, b, DEPTH).square().sum()) for a, b in zip(given, own, strict=True)]
     assert 0.5 < sum(shares) / sum(before) < 1  # 6 of 48 numbers are common
 
 
@@ -226,31 +233,33 @@ def test_the_photograph_stays_when_the_pose_changes() -> None:
 
 def test_views_are_the_same_until_poses_change() -> None:
     given = cameras()
-    poses, views = Poses(PoseOptions(), given, 10), [View(str(n), c, Asked()) for n, c in enumerate(given)]
-    assert poses.views(views) is views
+    poses, views = poses_of(PoseOptions(), 10), [View(str(n), c, Asked()) for n, c in enumerate(given)]
+    assert poses.transform_views(views, 1) is views
     other = [nudged(camera, twist) for camera, twist in zip(given, 1e-2 * numbers(8, 6), strict=True)]
     motion = poses.correct(given, other, DEPTH, 5, 0.7)
-    made = poses.views(views)
-    assert poses.views(views) is made
-    moves = [in_px(a, b.camera, DEPTH).square().sum() for a, b in zip(given, made, strict=True)]
+    made = poses.transform_views(views, 1)
+    assert poses.transform_views(views, 2) is made
+    moves = [motion_px(a, b.camera, DEPTH).square().sum() for a, b in zip(given, made, strict=True)]
     assert motion == pytest.approx(float(torch.stack(moves).mean().sqrt()), rel=1e-5)
-    kept = poses.tensors()
-    again = Poses(PoseOptions(when="auto", times=1), given, 10)
-    again.restore(kept)
-    assert torch.equal(again.views(views)[3].camera.rotation, made[3].camera.rotation)
-    assert (again.corrected, again.error) == (5, 0.7)
-    again.restore({name: value for name, value in kept.items() if name != "error"})  # as earlier ones were
+    kept = poses.state_dict()
+    again = poses_of(PoseOptions(when="auto", times=1), 10)
+    again.load_state_dict(kept)
+    assert torch.equal(again.transform_views(views, None)[3].camera.rotation, made[3].camera.rotation)
+    assert (again.last_estimate, again.error) == (5, 0.7)
+    again.load_state_dict({name: value for name, value in kept.items() if name != "error"})  # as earlier ones were
     assert again.expected_error(3, math.nan) == 0.5
-    poses.restore({})
-    assert poses.views(views) is views
+    poses.load_state_dict({})
+    assert poses.transform_views(views, 1) is views
 
 
 def test_appearance_codes_go_with_photographs_whatever_their_pose(tmp_path: Path) -> None:
-    settings = tiny_settings(tmp_path, "backbone=scaffold", "scene.width=96", "scene.height=72", "training.coarse=2",
-                             "training.coarse_until=0.5", "iterations=10")  # fmt: skip
+    coarse = ("training.coarse_to_fine.factor=2", "training.coarse_to_fine.until=0.5")
+    settings = tiny_settings(
+        tmp_path, "backbone=scaffold", "scene.width=96", "scene.height=72", "iterations=10", *coarse
+    )
     run = build(settings, load_scene(settings), tmp_path, training=True)
     coarse, own = run.views.at(1), run.scene.train
-    run.poses.take(
+    run.modules["poses"].take(
         torch.stack([torch.cat([v.camera.rotation, v.camera.translation[:, None]], 1) for v in own]).double()
     )
     assert coarse[0].camera.width == 48
@@ -262,9 +271,9 @@ def test_appearance_codes_go_with_photographs_whatever_their_pose(tmp_path: Path
 def test_small_photographs_are_not_made_smaller(tmp_path: Path) -> None:
     settings = tiny_settings(tmp_path, "scene.width=96", "scene.height=72", "iterations=10")
     run = build(settings, load_scene(settings), tmp_path, training=True)
-    for least, width in ((0, 48), (48 * 36, 48), (48 * 36 + 1, 96)):
-        small, shown = captures.seen_smaller(run, run.scene.train[0], depth=False, least=least)
-        assert (small.camera.width, shown.image.shape[2]) == (width, width)
+    for pixels, width in ((0, 48), (48 * 36, 48), (48 * 36 + 1, 96)):
+        small, rendering = render_reduced(run, run.scene.train[0], depth=False, min_pixels=pixels)
+        assert (small.camera.width, rendering.image.shape[2]) == (width, width)
 
 
 # -- runs ------------------------------------------------------------------------------------------------------------
@@ -282,7 +291,7 @@ WRONG = (
 
 def wrong_run(folder: Path, stop_after: int | None = None) -> Run:
     """A run with wrong poses, which pictures as small as these do not tell."""
-    with patch.object(captures, "usual_shift", return_value=1.7312345678901233):
+    with patch.object(poses_module, "usual_shift", return_value=1.7312345678901233):
         return tiny_run(folder, WRONG, stop_after)
 
 
@@ -295,13 +304,13 @@ def corrected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Path]:
 
 def test_a_run_with_corrected_poses_resumes_as_if_never_stopped(corrected: tuple[Run, Path], tmp_path: Path) -> None:
     whole, folder = corrected
-    assert whole.poses.matrices is not None
-    assert len(whole.poses.matrices) == 6
+    assert whole.modules["poses"].matrices is not None
+    assert len(whole.modules["poses"].matrices) == 6
     wrong_run(tmp_path / "stopped", stop_after=3)
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
-    assert run.poses.matrices is not None
-    assert (run.poses.corrected, run.poses.error) == (2, 1.7312345678901233)
-    with patch.object(captures, "aligned", wraps=captures.aligned) as corrections:
+    assert run.modules["poses"].matrices is not None
+    assert (run.modules["poses"].last_estimate, run.modules["poses"].error) == (2, 1.7312345678901233)
+    with patch.object(poses_module, "aligned", wraps=poses_module.aligned) as corrections:
         execute(run, settings, plugins())
     held = [call.kwargs["held"] for call in corrections.call_args_list]
     assert held == pytest.approx([250 / (0.5 * 1.7312345678901233)] * 6 + [1000] * 6)
@@ -310,8 +319,8 @@ def test_a_run_with_corrected_poses_resumes_as_if_never_stopped(corrected: tuple
     assert "poses.matrices" in a
     assert all(torch.equal(a[name], b[name]) for name in a)
     longer, _ = open_run(tmp_path / "stopped", plugins(), ["iterations=300"], training=True)
-    longer.step = longer.poses.steps()[0] - 1
-    assert "pose_spread" not in judge_photographs(longer), "corrected poses are judged anew"
+    longer.step = longer.modules["poses"].milestones()[0] - 1
+    assert "pose_spread" not in longer.modules["poses"].before_step(longer), "corrected poses are tested again"
 
 
 def test_a_step_that_is_given_up_after_a_correction_is_taken_by_the_same_poses(
@@ -328,9 +337,9 @@ def test_a_step_that_is_given_up_after_a_correction_is_taken_by_the_same_poses(
     with patch.object(trainer, "view_loss", stop):
         wrong_run(tmp_path / "stopped")
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
-    assert (run.step, run.poses.corrected) == (3, 4)
+    assert (run.step, run.modules["poses"].last_estimate) == (3, 4)
     execute(run, settings, plugins())
-    assert torch.equal(run.poses.matrices, whole.poses.matrices)
+    assert torch.equal(run.modules["poses"].matrices, whole.modules["poses"].matrices)
     a, b = final_tensors(folder), final_tensors(tmp_path / "stopped")
     assert all(torch.equal(a[name], b[name]) for name in a)
 
@@ -339,8 +348,8 @@ def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path
     short = ["iterations=6", "eval.zoom=[1]"]
     plain = tiny_run(tmp_path / "plain", short)
     judged = tiny_run(tmp_path / "judged", [*short, "training.poses.when=auto", "training.poses.spread=50"])
-    assert plain.poses.matrices is None
-    assert judged.poses.matrices is None
+    assert not plain.modules["poses"].active
+    assert not judged.modules["poses"].active
     assert [line["poses"] for line in judged.curves if "pose_spread" in line] == [0]
     a, b = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "judged")
     assert a.keys() == b.keys()

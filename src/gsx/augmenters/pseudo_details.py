@@ -145,8 +145,7 @@ class PseudoDetails(Redrawing):
         Raises:
             InputError: the run is past the event, and the file of its pseudo views is gone.
         """
-        left_out = run.plateau.left_out
-        fresh = all(number in left_out for number in range(event + 1, run.step + 1))  # no step of it was taken yet
+        fresh = all(run.skipped(step) for step in range(event + 1, run.step + 1))  # no step of it was taken yet
         made = self.written(run, event, view) if fresh and run.ranks.first else None
         if fresh:
             run.ranks.all_gather(None)  # the others wait for the file

@@ -178,7 +178,7 @@ class MipFilter:
     def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
         """Sizes from where the primitives are after a step (Mip-Splatting, compute_3D_filter)."""
         points, options, resolution = means.detach(), self.options, self.context.views
-        cameras = resolution.rendered_cameras(step + 1)
+        cameras = resolution.raster_cameras(step + 1)
         sizes = filter_sizes(points, cameras, options)
         if options.views > 1:
             sizes = sizes / several_views(points, cameras, sizes, options)

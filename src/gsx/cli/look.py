@@ -77,7 +77,9 @@ def verb_explain(arguments: list[str]) -> int:
     """gsx explain KEY [KEY=VALUE ...]"""
     told = "What a key of the configuration is, or a group: its value, what else it may be, who says so, and why."
     parser = Parser(prog="gsx explain", usage="%(prog)s KEY [KEY=VALUE ...]", description=told)
-    parser.add_argument("key", metavar="KEY", help="for example training.supersample, backbone, backbone=scaffold")
+    parser.add_argument(
+        "key", metavar="KEY", help="for example training.supersampling.factor, backbone, backbone=scaffold"
+    )
     parser.add_overrides("in this composition instead of the default")
     given = parser.parse_args(arguments)
     with loading():

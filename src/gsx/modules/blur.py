@@ -1,107 +1,167 @@
-"""Photographs taken by a camera that moved: their renders are blurred alike before they are compared.
+"""Photos taken by a camera that moved: their renders are blurred alike before they are compared.
 
-Photographs that are less sharp than their neighbours are suspected (`core.quality.sharpness`). From what the model
-shows in their places the movement of the camera is estimated (`modules.motion_blur`), a few times as it gets
-better. The loss is that of the render as such a camera would have taken it, so that the model stays sharp where the
-photograph is not. Test photographs play no part.
+Photos that are less sharp than their neighbours are candidates (`core.quality.sharpness`). The movement of their camera
+is estimated from the model's renders (`modules.motion_blur`), a few times as the model gets better. The loss compares
+the render as such a camera would have taken it, so that the model stays sharp where the photo is not. Test photos play
+no part.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Annotated
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from gsx.core.data.coarser import coarser
 from gsx.core.data.scene import View
+from gsx.core.data.window import Window
 from gsx.core.quality.sharpness import against_neighbours, fineness
 from gsx.core.ranges import Range, Share
-from gsx.core.shapes import Float
-from gsx.modules.motion_blur import Movement
+from gsx.core.training.module import ModuleContext
+from gsx.core.training.render import render
+from gsx.core.training.run import Run
+from gsx.modules.corrections import Correction, CorrectionOptions, Times
+from gsx.modules.motion_blur import Movement, movement_between
 from gsx.modules.movement import blurred_to_learn
-from gsx.modules.occasions import due_at, occasions, refuse_wrong
+from gsx.modules.photo_pairs import match_brightness
+
+logger = logging.getLogger(__name__)
+
+MAX_PIXELS = 1 << 18
+"""Movements are estimated from views of at most so many pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class BlurOptions:
-    """Options; values in conf/config.yaml."""
+class BlurOptions(CorrectionOptions):
+    """Options; values in conf/module/blur.yaml."""
 
-    when: str = "never"
-    """auto: where photographs that are less sharp than their neighbours are blurred; always: without asking."""
-    start: Share = 0.2
-    """Share of the steps after which movements are estimated first."""
+    key: ClassVar[str] = "blur"
     until: Share = 0.85
-    """Share of the steps after which they are last."""
-    times: Annotated[int, Range(1, 1000)] = 6
-    """How often they are, at shares that grow by the same factor."""
+    """Share of the steps before the last estimate."""
+    times: Times = 6
+    """Number of estimates, at shares that grow by the same factor."""
     sharpness: Annotated[float, Range(0, 10)] = 0.9
-    """`auto`: of the fine contrast of their neighbours; photographs that have less are asked."""
+    """`auto`: photos with less than this share of their neighbours' fine contrast are candidates."""
     length: Annotated[float, Range(0, 100)] = 1.0
-    """Px; shorter movements blur nothing."""
+    """Shorter movements, px, blur nothing."""
     explained: Share = 0.01
-    """Share of the squared difference from the model, at its best gains, that a movement has to explain in each half
-    of a photograph that shows it."""
-
-    def __post_init__(self) -> None:
-        refuse_wrong("blur", self)
+    """Share of the squared difference from the model, at its best gains, that a movement must explain in each half of a
+    photo that shows it."""
 
 
-@dataclass(eq=False)
-class Blur:
-    """Of a run's training photographs. Renders stay as they are before `move`."""
+class Blur(Correction):
+    """Movements of the cameras of training photos during their exposure."""
 
-    options: BlurOptions = field(default_factory=BlurOptions)
-    iterations: int = 0
-    movements: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Across and down, as shares of the frame's sides, by name, of photographs that are blurred."""
-    asked: int = 0
-    """The last step before which they were estimated: not again where that step is taken anew."""
+    options: BlurOptions
+    seconds_key = "blur_seconds"
 
-    def steps(self) -> list[int]:
-        """The steps before which movements are estimated."""
-        return occasions(self.options, self.iterations)
+    def __init__(self, options: BlurOptions, context: ModuleContext) -> None:
+        super().__init__(options, context)
+        self.movements: dict[str, tuple[float, float]] = {}
+        """Movement to the right and down, as shares of the frame's sides, by the names of blurred photos."""
 
-    def due(self, number: int) -> bool:
-        """Whether they are estimated before this step: after the first time only if there are any."""
-        return due_at(number, self.steps(), self.asked, bool(self.movements))
+    @property
+    def active(self) -> bool:
+        """Whether photos are blurred."""
+        return bool(self.movements)
 
-    def suspects(self, views: Sequence[View]) -> list[View]:
-        """The photographs that are asked: at first those less sharp than their neighbours by name, and all where one of
-        these is blurred."""
+    def restarted(self, context: ModuleContext) -> "Blur":
+        """Returns a module with the present movements, which estimates none."""
+        module = Blur(BlurOptions(), context)
+        module.movements = dict(self.movements)
+        return module
+
+    def estimate(self, run: Run, step: int) -> dict[str, float]:
+        """Estimate by how much the camera moved in each candidate."""
+        candidates = self.candidates(run.train_views)
+        lengths = self.move({view: self.estimate_movement(run, view) for view in candidates}, step)
+        middle = {"blur_length": median(lengths)} if lengths else {}
+        length = f", median movement {median(lengths):.1f} px" if lengths else ""
+        logger.info(
+            "step %d: %d of %d candidate photos are motion-blurred%s", step, len(lengths), len(candidates), length
+        )
+        return {"blurred": len(lengths), "blur_suspects": len(candidates)} | middle
+
+    def candidates(self, views: Sequence[View]) -> list[View]:
+        """Returns the photos to estimate: those less sharp than neighbours by name, or all if any is blurred."""
         if self.options.when == "always" or self.movements:
             return list(views)
         ordered = sorted({view.name: view for view in views}.values(), key=lambda view: view.name)
         fine = torch.stack([fineness((view.image() * 255).round().byte()) for view in ordered])
-        found = zip(ordered, against_neighbours(fine).tolist(), strict=True)
-        return [view for view, sharpness in found if sharpness < self.options.sharpness]
+        relative = zip(ordered, against_neighbours(fine).tolist(), strict=True)
+        return [view for view, sharpness in relative if sharpness < self.options.sharpness]
+
+    def estimate_movement(self, run: Run, view: View) -> Movement:
+        """Returns the movement of a photo's camera, px of the photo."""
+        run.refuse_if_stopping()
+        small = reduced_to(view, run, MAX_PIXELS)
+        photo, mask, image = small.image(), small.counted(), render(run, small.camera, supersample=1).image
+        sharp = run.views.without(self).match_photo(image, None, small).detach().cpu()
+        movement = movement_between(match_brightness(sharp, photo, mask), photo, mask)
+        return movement.times(view.camera.focal / small.camera.focal)
 
     def counts(self, movement: Movement) -> bool:
-        """Whether a photograph is blurred, by what was found of it."""
+        """Returns whether an estimated movement blurs a photo."""
         return movement.length >= self.options.length and movement.explained >= self.options.explained
 
-    def move(self, found: Mapping[View, Movement], number: int) -> list[float]:
-        """These movements, px of their views, from a step on, as far as they count; returns the lengths of those."""
-        kept = {view: one for view, one in found.items() if self.counts(one)}
-        self.movements = {view.name: view.camera.frame.shares(one.across, one.down) for view, one in kept.items()}
-        self.asked = number
-        return [one.length for one in kept.values()]
+    def move(self, estimates: Mapping[View, Movement], step: int) -> list[float]:
+        """Take the movements, px of their views, that count; returns their lengths, px."""
+        kept = {view: movement for view, movement in estimates.items() if self.counts(movement)}
+        self.movements = {view.name: view.camera.frame.shares(m.across, m.down) for view, m in kept.items()}
+        self.last_estimate = step
+        return [movement.length for movement in kept.values()]
 
-    def applied(self, image: Float[Tensor, "C H W"], view: View) -> Float[Tensor, "C H W"]:
-        """A render as the camera of a photograph would have taken it, at whatever size it is."""
+    def transform_render(
+        self, image: Tensor, view: View, photo: Tensor | None, window: Window | None, learning: bool
+    ) -> Tensor:
+        """Returns the render as the camera of a photo would have taken it, at any size."""
         if view.name not in self.movements:
             return image
         (across, down), frame = self.movements[view.name], view.camera.frame
         return blurred_to_learn(image, across * frame.width, down * frame.height)
 
-    def tensors(self) -> dict[str, Tensor]:
-        """What a checkpoint holds of them; nothing where there are none."""
+    def state_dict(self) -> dict[str, Tensor]:
+        """Returns the movements; empty where there are none."""
         if not self.movements:
             return {}
-        told = {f"of {name}": torch.tensor(movement, dtype=torch.float64) for name, movement in self.movements.items()}
-        return {"asked": torch.tensor(self.asked)} | told
+        tensors = {
+            f"of {name}": torch.tensor(movement, dtype=torch.float64) for name, movement in self.movements.items()
+        }
+        return {"asked": torch.tensor(self.last_estimate)} | tensors
 
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a checkpoint's tensors; none: renders stay as they are."""
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go on from a checkpoint; empty: no photo is blurred."""
         names = [name for name in tensors if name != "asked"]
         self.movements = {name.removeprefix("of "): tuple(tensors[name].tolist()) for name in names}
-        self.asked = int(tensors["asked"]) if tensors else 0
+        self.last_estimate = int(tensors["asked"]) if tensors else 0
+
+    def summary(self, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Returns when movements were estimated first, and of how many photos at last."""
+        held = [line for line in lines if self.seconds_key in line]
+        if not held:
+            return {}
+        figures = {"step": held[0]["step"], "blurred": held[-1]["blurred"], "asked": held[-1]["blur_suspects"]}
+        figures |= {"length": held[-1].get("blur_length", 0.0), "seconds": sum(line[self.seconds_key] for line in held)}
+        return {"blur": figures}
+
+    def remarks(self, evaluation: Mapping[str, Any]) -> Iterator[str]:
+        """Yields that photos are blurred."""
+        figures = evaluation.get("blur") or {}
+        if figures.get("blurred"):
+            yield (
+                f"the camera moved in {figures['blurred']} training photos, median {figures['length']:.1f} px: renders "
+                f"are blurred alike before they are compared, from step {figures['step']:,} on"
+            )
+
+
+def reduced_to(view: View, run: Run, pixels: int) -> View:
+    """Returns the view halved until it has at most so many pixels, or cannot be halved."""
+    while view.camera.width * view.camera.height > pixels:
+        halved = coarser(view, run.scene.reduction, 2)
+        if halved is view:
+            break
+        view = halved
+    return view

@@ -1,149 +1,240 @@
-"""Distractors: what stands before the scene in one training photograph alone does not count.
+"""Distractors: what stands before the scene in one training photo alone does not count.
 
-Whether there are any is judged once, from some photographs (`modules.distractor_masks`). If so, those of all
-photographs are found, and again a few times as the model learns more; pixels that show one count in no loss, no
-growth and no figure from there on, as if a mask had left them out, but in pseudo views that were made before. Test
-photographs play no part.
+One test on some photos decides whether there are any (`modules.distractor_masks`). If so, all photos are searched, and
+again a few times as the model learns more. Pixels that show a distractor enter no loss, no growth and no figure from
+then on, as if a mask had left them out, but for pseudo views that were made before. Test photos play no part.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Annotated
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.coarser import CoarseSource
+from gsx.core.data.coarser import CoarseSource, coarser
 from gsx.core.data.scene import CutOut, DerivedSource, View
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Int
-from gsx.modules.occasions import MadeOf, due_at, occasions, refuse_wrong, some_photographs
+from gsx.core.training.importance import Probe
+from gsx.core.training.module import ModuleContext
+from gsx.core.training.parameter_table import keep_rows
+from gsx.core.training.run import Run
+from gsx.modules.corrections import Correction, CorrectionOptions, Times, ViewCache, ViewCount, sample
+from gsx.modules.distractor_masks import Difference, difference_of, distractors_in
+from gsx.modules.photo_pairs import REDUCTION, gains, match_brightness, render_reduced
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistractorOptions:
-    """Options; values in conf/config.yaml."""
+class DistractorOptions(CorrectionOptions):
+    """Options; values in conf/module/distractors.yaml."""
 
-    when: str = "never"
-    """auto: where photographs show what others do not."""
+    key: ClassVar[str] = "distractors"
     start: Share = 0.1
-    """Share of the steps after which that is judged, and distractors are found first."""
+    """Share of the steps before the test and the first search."""
     until: Share = 0.8
-    """Share of the steps after which they are found last."""
-    times: Annotated[int, Range(1, 1000)] = 6
-    """How often they are, at shares that grow by the same factor."""
+    """Share of the steps before the last search."""
+    times: Times = 6
+    """Number of searches, at shares that grow by the same factor."""
     share: Annotated[float, Range(0, 1)] = 0.03
-    """`auto`: of the pictures that are judged by, from which on what shows a distractor does not count."""
-    views: Annotated[int, Range(3, 10**6)] = 24
-    """Photographs that are judged by, at most."""
+    """`auto`: share of the tested pixels that show distractors, above which these do not count."""
+    views: ViewCount = 24
+    """Most photos that the test uses."""
 
-    def __post_init__(self) -> None:
-        refuse_wrong("distractors", self)
+
+class Distractors(Correction):
+    """Masks of distractors in training photos."""
+
+    options: DistractorOptions
+    seconds_key = "distractor_seconds"
+
+    def __init__(self, options: DistractorOptions, context: ModuleContext) -> None:
+        super().__init__(options, context)
+        self.masks: Sequence[Bool[Tensor, "h w"]] | None = None
+        """Pixels that show a distractor, of each photo in order; None: no photo is masked."""
+        self.cache = ViewCache()
+
+    @property
+    def active(self) -> bool:
+        """Whether photos are masked."""
+        return self.masks is not None
+
+    def restarted(self, context: ModuleContext) -> "Distractors":
+        """Returns a module that masks nothing: the other run gets masked views."""
+        return Distractors(DistractorOptions(), context)
+
+    def transform_views(self, views: Sequence[View], step: int | None) -> Sequence[View]:
+        """Returns the views without their distractors."""
+        if self.masks is None:
+            return views
+        masks = self.masks
+        return self.cache.get(views, lambda: mask_views(views, masks))
+
+    # -- estimates -----------------------------------------------------------------------------------------------------
+
+    def estimate(self, run: Run, step: int) -> dict[str, float]:
+        """Test whether photos show distractors, where that is due first, and mask those of all photos if so.
+
+        Primitives that mostly show masked pixels go: what they show was learnt before.
+        """
+        views, metrics, needed = run.views.without(self).full_size, dict[str, float](), True
+        differences = dict[View, Difference]()
+        if step == self.milestones()[0]:
+            differences = measure_differences(run, sample(views, self.options.views, "distractors"))
+            share = mean_share(distractors_in(list(differences.values())))
+            needed = self.options.when == "always" or share > self.options.share
+            metrics["distractor_share"] = share
+            log_test(step, share, self.options.share, needed)
+        if needed:
+            differences |= measure_differences(run, [view for view in views if view not in differences])
+        masks = distractors_in([differences[view] for view in views]) if needed else None
+        removed = None if masks is None else rows_of_distractors(run, mask_views(views, masks))
+        metrics["distractors"] = self.mask(masks, step)  # with their primitives, or neither
+        if removed is not None:
+            metrics["forgotten"] = remove_rows(run, removed)
+            logger.info(
+                "step %d: %.1f %% of pixels masked, %d primitives that show them removed",
+                *(step, 100 * metrics["distractors"], metrics["forgotten"]),
+            )
+        return metrics
+
+    def mask(self, masks: Sequence[Bool[Tensor, "h w"]] | None, step: int) -> float:
+        """Use these masks from a step on; returns their mean share of the pixels."""
+        self.masks, self.last_estimate, self.cache = masks, step, ViewCache()
+        return mean_share(masks or [])
+
+    # -- files ---------------------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Returns the masks; empty where there are none."""
+        if self.masks is None:
+            return {}
+        masks = {str(index): mask for index, mask in enumerate(self.masks)}
+        return {"looked": torch.tensor(self.last_estimate)} | masks
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go on from a checkpoint; empty: all pixels count."""
+        masks = [tensors[str(index)].clone() for index in range(len(tensors) - 1)] if tensors else None
+        self.mask(masks, int(tensors["looked"]) if tensors else 0)
+
+    def summary(self, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Returns when photos were tested, the share that the test found, and the masked shares since.
+
+        A stop before the step was taken loses its line.
+        """
+        held = [line for line in lines if self.seconds_key in line]
+        if not held:
+            return {}
+        masked = [line["distractors"] for line in held] if any(line["distractors"] for line in held) else []
+        shares = [line["distractor_share"] for line in held if "distractor_share" in line]
+        seconds = sum(line[self.seconds_key] for line in held)
+        figures = {"step": held[0]["step"], "share": (shares or [None])[0], "marked": masked, "seconds": seconds}
+        return {"distractors": figures}
+
+    def remarks(self, evaluation: Mapping[str, Any]) -> Iterator[str]:
+        """Yields that parts of training photos do not count."""
+        figures = evaluation.get("distractors") or {}
+        if figures.get("marked"):
+            yield (
+                f"{figures['marked'][-1]:.1%} of the pixels of training photos show what others do not, and do not "
+                f"count from step {figures['step']:,} on"
+            )
+
+
+def log_test(step: int, share: float, threshold: float, needed: bool) -> None:
+    """Log the share of pixels that show distractors, and what follows."""
+    sign, verdict = ">" if share > threshold else "<=", "masking photos" if needed else "all pixels count"
+    logger.info("step %d: distractors %.1f %% %s %.1f %%, %s", step, 100 * share, sign, 100 * threshold, verdict)
+
+
+def measure_differences(run: Run, views: Sequence[View]) -> dict[View, Difference]:
+    """Returns the difference of each reduced photo from its render."""
+    return {view: measure_difference(run, view) for view in views}
+
+
+def measure_difference(run: Run, view: View) -> Difference:
+    """Returns the difference of a reduced photo from its render."""
+    small, rendering = render_reduced(run, view)
+    assert rendering.depth is not None
+    photo, mask = small.image(), small.counted()
+    brightness = gains(rendering.image, photo, mask)
+    image = match_brightness(run.views.match_photo(rendering.image, None, small).detach().cpu(), photo, mask)
+    return difference_of(small.camera, image, rendering.depth, rendering.alpha, photo, mask, brightness)
+
+
+def rows_of_distractors(run: Run, views: Sequence[View]) -> Bool[Tensor, "N"]:
+    """Returns the primitives that are mostly visible where pixels of photos do not count."""
+    probe = Probe(model=run.backbone, views=run.views, step=run.model_step)
+    hidden, total = run.background.new_zeros(2, len(run.backbone.table))
+    for view in views:
+        run.refuse_if_stopping()
+        small = coarser(view, run.scene.reduction, REDUCTION)
+        masked, everywhere = probe.render(small.camera).blending_weights(small.counted())
+        hidden, total = hidden + masked, total + everywhere
+    return hidden > total / 2
+
+
+def remove_rows(run: Run, rows: Bool[Tensor, "N"]) -> int:
+    """Remove primitives, unless they are all; returns how many."""
+    if bool(rows.all()):
+        return 0
+    keep_rows(run.backbone.table, ~rows)
+    return int(rows.sum())
+
+
+def mean_share(masks: Sequence[Bool[Tensor, "h w"]]) -> float:
+    """Returns the masked share of the pixels, in the mean over photos."""
+    return sum(float(mask.float().mean()) for mask in masks) / max(1, len(masks))
+
+
+# -- views without distractors -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MaskedSource(DerivedSource):
-    """A photograph of which the blocks that show a distractor do not count."""
+    """A photo of which the blocks that show a distractor do not count."""
 
-    marked: Bool[Tensor, "h w"]
-    """Blocks of whole pixels of the photograph that show one; the last row and column take what is left over."""
+    masked: Bool[Tensor, "h w"]
+    """Blocks of whole pixels of the photo that show one; the last row and column take what is left over."""
     size: tuple[int, int]
-    """(width, height) of the photograph, px."""
+    """(width, height) of the photo, px."""
 
     def counted(self, camera: Camera) -> Bool[Tensor, "H W"]:
-        """Return which pixels count in the other source and show no distractor."""
-        (height, width), frame = self.marked.shape, camera.frame
+        """Returns the pixels that count in the other source and show no distractor."""
+        (height, width), frame = self.masked.shape, camera.frame
         down = block_of(frame.top, camera.height, frame.height, self.size[1], height)
         across = block_of(frame.left, camera.width, frame.width, self.size[0], width)
-        free, counted = ~self.marked[down[:, None], across], super().counted(camera)
-        return free if counted is None else free & counted
+        clear, counted = ~self.masked[down[:, None], across], super().counted(camera)
+        return clear if counted is None else clear & counted
 
     def transparent(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
-        """Return which pixels of the other source show the background alone."""
+        """Returns the pixels of the other source that show the background alone."""
         return self.source.transparent(camera) if isinstance(self.source, CutOut) else None
 
 
 def block_of(first: int, count: int, frame: int, size: int, blocks: int) -> Int[Tensor, "P"]:
-    """In which of so many blocks along an axis of a photograph of that size pixels lie: `count` from the `first` of a
-    frame on, which is the photograph in so many pixels."""
+    """Returns the block of each of `count` pixels, the first of them at `first` of a frame, along an axis of a photo.
+
+    frame: pixels of the whole photo at the scale of these. size: px of the photo. blocks: of the photo.
+    """
     places = (torch.arange(count) + 0.5 + first) / frame * size
     return (places / max(1, size // blocks)).long().clamp(0, blocks - 1)
 
 
-def without_marked(views: Sequence[View], marked: Sequence[Bool[Tensor, "h w"]]) -> list[View]:
-    """Views without what is marked in their photographs."""
-    return [mask_view(view, one) for view, one in zip(views, marked, strict=True)]
+def mask_views(views: Sequence[View], masks: Sequence[Bool[Tensor, "h w"]]) -> list[View]:
+    """Returns views without what is masked in their photos."""
+    return [mask_view(view, mask) for view, mask in zip(views, masks, strict=True)]
 
 
-def mask_view(view: View, marked: Bool[Tensor, "h w"]) -> View:
-    """The view without what is marked in its photograph; itself where nothing is. Of a coarse pixel nothing may be."""
-    if not bool(marked.any()):
+def mask_view(view: View, mask: Bool[Tensor, "h w"]) -> View:
+    """Returns the view without what is masked in its photo: of a coarse pixel no part may be."""
+    if not bool(mask.any()):
         return view
     if isinstance(view.source, CoarseSource):
-        return replace(view, source=view.source.of(mask_view(view.source.view, marked)))
+        return replace(view, source=view.source.of(mask_view(view.source.view, mask)))
     frame = view.camera.frame
-    return replace(view, source=MaskedSource(source=view.source, marked=marked, size=(frame.width, frame.height)))
-
-
-@dataclass(eq=False)
-class Distractors:
-    """Of a run's training photographs. All pixels count before `mark`."""
-
-    options: DistractorOptions = field(default_factory=DistractorOptions)
-    iterations: int = 0
-    marked: Sequence[Bool[Tensor, "h w"]] | None = None
-    """Of each photograph, in order; None: they were not needed."""
-    looked: int = 0
-    """The last step before which they were found: not again where that step is taken anew."""
-    seen: MadeOf = field(default_factory=MadeOf)
-    """Views that were asked for, and what they are without distractors."""
-
-    def steps(self) -> list[int]:
-        """The steps before which they are found, if there are any, the first of them after that is judged."""
-        return occasions(self.options, self.iterations)
-
-    @property
-    def first(self) -> int:
-        """The step before which it is judged whether there are any."""
-        return self.steps()[0]
-
-    def due(self, number: int) -> bool:
-        """Whether they are judged or found before this step."""
-        return due_at(number, self.steps(), self.looked, self.marked is not None)
-
-    def judged_by(self, views: Sequence[View]) -> list[View]:
-        """The photographs that it is judged by: the same in every run."""
-        return some_photographs(views, self.options.views, "distractors")
-
-    def needed(self, share: float) -> bool:
-        """Whether a share of pictures that shows distractors asks for masks."""
-        return self.options.when == "always" or share > self.options.share
-
-    def views(self, views: Sequence[View]) -> Sequence[View]:
-        """The training views, in order, without their distractors; the same ones until others are found."""
-        if self.marked is None:
-            return views
-        marked = self.marked
-        return self.seen.views(views, lambda: without_marked(views, marked))
-
-    def mark(self, marked: Sequence[Bool[Tensor, "h w"]] | None, number: int) -> float:
-        """These from a step on; returns their share of the pictures."""
-        self.marked, self.looked, self.seen = marked, number, MadeOf()
-        return share_of(marked or [])
-
-    def tensors(self) -> dict[str, Tensor]:
-        """What a checkpoint holds of them; nothing where there are none."""
-        if self.marked is None:
-            return {}
-        return {"looked": torch.tensor(self.looked)} | {str(n): marked for n, marked in enumerate(self.marked)}
-
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a checkpoint's tensors; none: all pixels count."""
-        marked = [tensors[str(number)].clone() for number in range(len(tensors) - 1)] if tensors else None
-        self.mark(marked, int(tensors["looked"]) if tensors else 0)
-
-
-def share_of(marked: Sequence[Bool[Tensor, "h w"]]) -> float:
-    """Of pictures, in the mean over them."""
-    return sum(float(one.float().mean()) for one in marked) / max(1, len(marked))
+    return replace(view, source=MaskedSource(source=view.source, masked=mask, size=(frame.width, frame.height)))

@@ -1,65 +1,63 @@
-"""Exposure and white balance of each photograph, learnt beside the model where photographs differ in them.
+"""Exposure and white balance of each photo, learnt with the model where photos differ in them.
 
-A photograph is compared with A [r, g, b, 1]^T of its render, A of 3 x 4 numbers per training photograph, learnt by Adam
-(3D-GS release, `exposure_lr_init`, `exposure_lr_final`). Ours: whether there are any is judged first; they begin where
-photographs and renders say instead of at the identity, and are set right by these a few times, since renders say little
-at first; their mean stays the identity, so that the model has the exposure of the mean photograph; and Adam keeps the
-steps of each photograph apart. One Adam over all of them, as published, goes on moving a photograph while others are
-shown: by several rates a visit, where one is meant. Behind A comes a bilateral grid, where light is found to differ
-within photographs (`modules.bilateral_grid`).
+A photo is compared with A [r, g, b, 1]^T of its render: A has 3 x 4 numbers per training photo and is learnt by Adam
+(3D-GS release, `exposure_lr_init`, `exposure_lr_final`). Ours: a test decides whether photos have exposures. They start
+from the gains between photos and renders instead of the identity, and these gains correct them a few times, since early
+renders say little. Their mean stays the identity, so that the model has the exposure of the mean photo. Adam counts the
+steps of each photo apart: one Adam over all of them, as published, goes on moving a photo while others are trained on,
+by several rates per visit. Where light differs within photos a bilateral grid comes behind A (`bilateral_grid`).
 """
 
+import logging
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Annotated, TypeAlias
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, TypeAlias
 
 import torch
 from torch import Tensor
 
-from gsx.core.ranges import Range, Share
+from gsx.core.data.scene import View
+from gsx.core.data.window import Window
+from gsx.core.quality.colour_matrix import transform_colours
+from gsx.core.ranges import Range
 from gsx.core.shapes import Bool, Float
+from gsx.core.training.module import ModuleContext
+from gsx.core.training.run import Run
 from gsx.core.training.schedule import log_linear
-from gsx.modules.bilateral_grid import WHOLE, first_matrices, slopes_of_light, through_grid, without_common
-from gsx.modules.occasions import WHEN, due_at, occasions, refuse_wrong, some_photographs
+from gsx.modules.bilateral_grid import WHOLE, apply_grid, initial_grids, light_slopes, without_common
+from gsx.modules.corrections import WHEN, Correction, CorrectionOptions, ViewCount, sample
+from gsx.modules.photo_pairs import LIGHT, Pair, log_gains, render_reduced, shared_spread, usable_pixels
+
+logger = logging.getLogger(__name__)
 
 PositiveRate = Annotated[float, Range(1e-9, 1)]
 BETAS, EPS = (0.9, 0.99), 1e-8
-"""Of Adam; a photograph is seen a few dozen times in a short run."""
-DARK, LIGHT = 0.05, 0.95
-"""Display values that tell a gain: below them noise does, above them they may be saturated."""
-FEWEST_PIXELS, FEWEST_OF_BLOCK, FEWEST_VIEWS = 64, 16, 3
-"""That tell a gain; that of a part of a picture; that tell a spread."""
+"""Of Adam; a short run visits a photo a few dozen times."""
+MIN_BLOCK_PIXELS = 16
+"""Fewest usable pixels of a block of a photo."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExposureOptions:
-    """Options; values in conf/config.yaml."""
+class ExposureOptions(CorrectionOptions):
+    """Options; values in conf/module/exposure.yaml."""
 
-    when: str = "never"
-    """auto: where photographs differ."""
-    start: Share = 0.2
-    """Share of the steps after which it is judged, and exposures are told first."""
-    until: Share = 0.7
-    """Share of the steps after which they are told last."""
-    times: Annotated[int, Range(1, 1000)] = 5
-    """How often they are, at shares that grow by the same factor; once where there are grids."""
+    key: ClassVar[str] = "exposure"
     spread: Annotated[float, Range(0, 1)] = 0.06
-    """`auto`: of log gains (standard deviation), from which on photographs have exposures of their own; as they have
-    where they have grids."""
+    """`auto`: standard deviation of log gains above which photos get exposures; those with grids have them."""
     grid: str = "never"
-    """auto: a bilateral grid of each photograph, where light differs within photographs."""
+    """One of WHEN; auto: a bilateral grid per photo where light differs within photos."""
     grid_spread: Annotated[float, Range(0, 1)] = 0.08
-    """`auto`: of slopes of log gains, from the middle of a photograph to its sides (standard deviation), from which on
-    there are grids."""
-    views: Annotated[int, Range(3, 10**6)] = 24
-    """Photographs that are judged by, at most."""
+    """`auto`: standard deviation of slopes of log gains, from the middle of a photo to its sides, above which photos
+    get grids."""
+    views: ViewCount = 24
+    """Most photos that the test uses."""
     rate: PositiveRate = 0.01
     rate_final: PositiveRate = 0.001
-    """Of Adam at the first and at the last step; their logarithm is interpolated."""
+    """Learning rates of Adam at the first and at the last step; their logarithm is interpolated."""
 
     def __post_init__(self) -> None:
-        refuse_wrong("exposure", self)
+        super().__post_init__()
         if self.grid not in WHEN:
             raise ValueError(f"training.exposure.grid is '{self.grid}'; choose from {', '.join(WHEN)}")
         if self.when == "never" != self.grid:
@@ -69,232 +67,288 @@ class ExposureOptions:
             )
 
 
-# -- what photographs and renders say ----------------------------------------------------------------------------------
-
-
-Pair: TypeAlias = tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"], Bool[Tensor, "H W"] | None]
-"""Render, photograph, which pixels count."""
+# -- light of a photo --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """What a render and a photograph say of that one's light."""
+    """How a photo's light differs from its render's."""
 
     gains: Float[Tensor, "3 3"]
-    """Log gains of the whole picture, of its left and of its right half; nan where nothing is told."""
+    """Log gains of the whole picture, of its left and of its right half; nan where pixels are too few."""
     slopes: Float[Tensor, "3 2 3"] | None
-    """Of log gains (`slopes_of_light`); None: not asked."""
+    """Slopes of log gains (`light_slopes`); None: not measured."""
+
+
+Measure: TypeAlias = Callable[[int], Light]
+"""Number of a photo -> its light, by one render."""
 
 
 def light_of(pair: Pair, slopes: bool) -> Light:
-    """Of a photograph; slopes: whether light may differ within it."""
-    if not slopes:
-        return Light(of_halves(*pair), None)
-    return Light(of_halves(*pair), slopes_of_light(pair[0], pair[1], telling(*pair), FEWEST_OF_BLOCK))
+    """Measure a photo's light; slopes: also within the photo."""
+    image, photo, _ = pair
+    within = light_slopes(image, photo, usable_pixels(*pair), MIN_BLOCK_PIXELS) if slopes else None
+    return Light(half_gains(*pair), within)
 
 
-def spreads_of(found: Sequence[Light]) -> tuple[float, float]:
-    """Of gains over photographs, and of slopes; nan where these were not asked."""
-    gains = torch.stack([one.gains for one in found])
-    slopes = [one.slopes for one in found if one.slopes is not None]
+def half_gains(image: Tensor, photo: Tensor, mask: Bool[Tensor, "H W"] | None) -> Float[Tensor, "3 3"]:
+    """Returns log gains of the whole picture, of its left and of its right half."""
+    half = image.shape[2] // 2
+    parts = (slice(None), slice(half), slice(half, None))
+    return torch.stack(
+        [log_gains(image[..., part], photo[..., part], None if mask is None else mask[..., part]) for part in parts]
+    )
+
+
+def spreads_of(lights: Sequence[Light]) -> tuple[float, float]:
+    """Returns the spread of gains over photos, and of slopes; nan where slopes were not measured."""
+    gains = torch.stack([light.gains for light in lights])
+    slopes = [light.slopes for light in lights if light.slopes is not None]
     within = shared_spread(*torch.stack(slopes)[:, 1:].flatten(2).unbind(1)) if slopes else math.nan
     return shared_spread(gains[:, 1], gains[:, 2]), within
 
 
-def telling(
-    image: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None
-) -> Bool[Tensor, "H W"]:
-    """Pixels that count and are neither dark nor light in either."""
-    told = ((image > DARK) & (image < LIGHT) & (photograph > DARK) & (photograph < LIGHT)).all(0)
-    return told if counted is None else told & counted.to(told.device)
-
-
-def log_gains(
-    image: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None = None
-) -> Float[Tensor, "3"]:
-    """Median of log(photograph / image) of each channel, over pixels that count and are neither dark nor light in
-    either; nan where they are too few."""
-    told = telling(image, photograph, counted)
-    if int(told.sum()) < FEWEST_PIXELS:
-        return torch.full((3,), math.nan)
-    return (photograph[:, told] / image[:, told]).log().double().median(dim=1).values.float().cpu()
-
-
-def of_halves(image: Tensor, photograph: Tensor, counted: Bool[Tensor, "H W"] | None) -> Float[Tensor, "3 3"]:
-    """Log gains of the whole picture, of its left and of its right half."""
-    half = image.shape[2] // 2
-    parts = (slice(None), slice(half), slice(half, None))
-    return torch.stack(
-        [log_gains(image[..., p], photograph[..., p], None if counted is None else counted[..., p]) for p in parts]
-    )
-
-
-def shared_spread(left: Float[Tensor, "N C"], right: Float[Tensor, "N C"]) -> float:
-    """Standard deviation of what is told of photographs, in the mean over channels, without the noise in which halves
-    of one differ: the root of the covariance of their halves; 0 where that is negative, or nothing is told."""
-    known = (left.isfinite() & right.isfinite()).all(1)
-    if int(known.sum()) < FEWEST_VIEWS:
-        return 0.0
-    centred = [half[known] - half[known].mean(0) for half in (left, right)]
-    covariance = (centred[0] * centred[1]).sum(0) / (int(known.sum()) - 1)
-    return math.sqrt(max(0.0, float(covariance.mean())))
-
-
-def relative_gains(found: Sequence[Light]) -> Float[Tensor, "N 3"]:
-    """Log gains of photographs beside their mean, which is the model's; 0 where nothing is told."""
-    gains = torch.stack([one.gains[0] for one in found])
+def relative_gains(lights: Sequence[Light]) -> Float[Tensor, "N 3"]:
+    """Returns log gains of photos relative to their mean, which is the model's; 0 where they are unknown."""
+    gains = torch.stack([light.gains[0] for light in lights])
     return (gains - gains.nanmean(0)).nan_to_num(0.0)
 
 
-# -- what is learnt ----------------------------------------------------------------------------------------------------
+# -- the module --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(eq=False)
-class Exposures:
-    """Of a run's training photographs. Nothing is learnt, and no picture changed, before `begin`."""
+class Exposure(Correction):
+    """Per-photo exposure: one 3x4 colour matrix, and a bilateral grid where light differs within photos."""
 
-    options: ExposureOptions = field(default_factory=ExposureOptions)
-    names: Sequence[str] = ()
-    """Of the photographs."""
-    iterations: int = 0
-    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
-    matrices: Float[Tensor, "N 3 4"] | None = None
-    moments: Float[Tensor, "2 N 3 4"] = field(default_factory=lambda: torch.zeros(2, 0, 3, 4))
-    """Adam's means of gradients and of their squares."""
-    grids: Float[Tensor, "N rank 3 4"] | None = None
-    """Matrices of bilateral grids; None: light does not differ within photographs."""
-    grid_moments: Float[Tensor, "2 N rank 3 4"] = field(default_factory=lambda: torch.zeros(2, 0, 0, 3, 4))
-    visits: Float[Tensor, "N"] = field(default_factory=lambda: torch.zeros(0))
-    """Steps of each photograph."""
-    told_last: int = 0
-    """The last step before which they were told: not again where that step is taken anew."""
-    shown: set[int] = field(default_factory=set)
-    """Photographs of the step under way."""
+    options: ExposureOptions
+    seconds_key = "exposure_seconds"
 
-    def steps(self) -> list[int]:
-        """The steps before which exposures are told, if they are, the first of them after photographs are judged; none
-        where nobody asks."""
-        return occasions(self.options, self.iterations)
+    def __init__(self, options: ExposureOptions, context: ModuleContext) -> None:
+        super().__init__(options, context)
+        self.indices = {view.name: index for index, view in reversed([*enumerate(context.scene.train)])}
+        """Number of a photo by its name; of photos of one name the first."""
+        self.matrices: Float[Tensor, "N 3 4"] | None = None
+        """None: photos do not differ."""
+        self.moments: Float[Tensor, "2 N 3 4"] = torch.zeros(2, 0, 3, 4)
+        """Adam's means of gradients and of their squares."""
+        self.grids: Float[Tensor, "N rank 3 4"] | None = None
+        """Matrices of bilateral grids; None: light does not differ within photos."""
+        self.grid_moments: Float[Tensor, "2 N rank 3 4"] = torch.zeros(2, 0, 0, 3, 4)
+        self.visits: Float[Tensor, N] = torch.zeros(0)
+        """Steps of each photo."""
+        self.rendered: set[int] = set()
+        """Photos of the step under way."""
 
-    def due(self, number: int) -> bool:
-        """Whether photographs are judged, or exposures told, before this step; grids know more than gains tell."""
-        return self.grids is None and due_at(number, self.steps(), self.told_last, self.matrices is not None)
+    @property
+    def count(self) -> int:
+        """Number of training photos."""
+        return len(self.context.scene.train)
 
-    def judge(self, look: Callable[[int], Pair], number: int) -> tuple[float, float]:
-        """Judge by some photographs before a step, and begin with the gains of all, if these are spread enough, or have
-        to be, and with grids likewise; returns both spreads, nan for what was not asked.
+    @property
+    def active(self) -> bool:
+        """Whether photos have exposures."""
+        return self.matrices is not None
 
-        look: (render, photograph, which pixels count) of the photograph of that number; each is looked at once at most.
+    def due(self, step: int) -> bool:
+        """Returns whether exposures are estimated before a step; grids know more than gains say."""
+        return self.grids is None and super().due(step)
+
+    # -- estimates -----------------------------------------------------------------------------------------------------
+
+    def estimate(self, run: Run, step: int) -> dict[str, float]:
+        """Test whether photos differ in exposure, or correct what is learnt by gains between photos and renders."""
+        views = run.train_views
+
+        def measure(index: int) -> Light:
+            return light_of(photo_pair(run, views[index]), slopes=not self.active and self.options.grid != "never")
+
+        if not self.active:
+            return log_test(self, step, *self.test(measure, step))
+        change = self.correct(measure, step)
+        logger.info("step %d: exposures re-estimated, RMS change %.1f %%", step, 100 * change)
+        return {"exposures": self.count, "exposure_motion": change}
+
+    def test(self, measure: Measure, step: int) -> tuple[float, float]:
+        """Measure some photos, and start from the gains of all if they differ; returns spreads of gains and slopes.
+
+        The spread of slopes is nan where grids are off.
         """
-        own, everyone = self.options, range(len(self.names))
-        found = {index: self.told(look(index)) for index in some_photographs(everyone, own.views, "exposures")}
-        spread, within = spreads_of(list(found.values()))
-        with_grids = own.grid == "always" or within > own.grid_spread
-        if own.when == "always" or spread > own.spread or with_grids:
-            found |= {index: self.told(look(index)) for index in everyone if index not in found}
-            self.correct([found[index] for index in everyone], with_grids, number)
+        options, everyone = self.options, range(self.count)
+        lights = {index: measure(index) for index in sample(everyone, options.views, "exposures")}
+        spread, within = spreads_of(list(lights.values()))
+        with_grids = options.grid == "always" or within > options.grid_spread
+        if options.when == "always" or spread > options.spread or with_grids:
+            lights |= {index: measure(index) for index in everyone if index not in lights}
+            self.restart([lights[index] for index in everyone], with_grids, step)
         return spread, within
 
-    def tell(self, look: Callable[[int], Pair], number: int) -> float:
-        """Set right before a step what is learnt; returns by how much that was off: log gains of photographs at their
-        exposures (root of the mean square). look: as above, renders at the exposures of their photographs."""
-        found = [light_of(look(index), slopes=False) for index in range(len(self.names))]
-        self.correct(found, with_grids=False, number=number)
-        return float(relative_gains(found).square().mean().sqrt())
-
-    def told(self, pair: Pair) -> Light:
-        """Of a photograph's light."""
-        return light_of(pair, slopes=self.options.grid != "never")
+    def correct(self, measure: Measure, step: int) -> float:
+        """Correct the exposures; returns by how much they were off: RMS of log gains."""
+        lights = [measure(index) for index in range(self.count)]
+        self.restart(lights, with_grids=False, step=step)
+        return float(relative_gains(lights).square().mean().sqrt())
 
     @torch.no_grad()
-    def correct(self, found: Sequence[Light], with_grids: bool, number: int) -> None:
-        """Learn on from what there is, with the gains and slopes that were found of each photograph before a step."""
-        gains = relative_gains(found).exp()
-        now = torch.eye(3, 4).expand(len(found), -1, -1) if self.matrices is None else self.matrices.cpu()
-        slopes = [one.slopes[0] for one in found if with_grids and one.slopes is not None]
-        self.begin(
-            centred_on_identity(gains[:, :, None] * now), first_matrices(torch.stack(slopes)) if slopes else None
-        )
-        self.told_last = number
+    def restart(self, lights: Sequence[Light], with_grids: bool, step: int) -> None:
+        """Go on learning from the present exposures times the gains of the photos."""
+        gains = relative_gains(lights).exp()
+        now = torch.eye(3, 4).expand(self.count, -1, -1) if self.matrices is None else self.matrices.cpu()
+        slopes = [light.slopes[0] for light in lights if with_grids and light.slopes is not None]
+        grids = initial_grids(torch.stack(slopes)) if slopes else None
+        self.start(centred_on_identity(gains[:, :, None] * now), grids)
+        self.last_estimate = step
 
-    def begin(self, matrices: Float[Tensor, "N 3 4"], grids: Float[Tensor, "N rank 3 4"] | None = None) -> None:
+    def start(self, matrices: Float[Tensor, "N 3 4"], grids: Float[Tensor, "N rank 3 4"] | None = None) -> None:
         """Learn from these on."""
-        self.matrices = matrices.to(self.device).requires_grad_()
-        self.moments, self.visits = torch.zeros(2, *matrices.shape, device=self.device), torch.zeros(len(matrices))
-        self.grids = None if grids is None else grids.to(self.device).requires_grad_()
-        self.grid_moments = torch.zeros(2, *(() if grids is None else grids.shape), device=self.device)
+        device = self.context.device
+        self.matrices = matrices.to(device).requires_grad_()
+        self.moments, self.visits = torch.zeros(2, *matrices.shape, device=device), torch.zeros(len(matrices))
+        self.grids = None if grids is None else grids.to(device).requires_grad_()
+        self.grid_moments = torch.zeros(2, *(() if grids is None else grids.shape), device=device)
 
-    def applied(
+    # -- learning ------------------------------------------------------------------------------------------------------
+
+    def transform_render(
+        self, image: Tensor, view: View, photo: Tensor | None, window: Window | None, learning: bool
+    ) -> Tensor:
+        """Returns the render at its photo's exposure; of a saturated value of the photo, more is no error."""
+        if self.matrices is None:
+            return image
+        edges = WHOLE if window is None else window.shares(*view.camera.size)
+        exposed = self.expose(image, self.indices[view.name], learning, edges)
+        return exposed if photo is None else torch.where((photo >= 1) & (exposed > 1), photo, exposed)
+
+    def expose(
         self,
         image: Float[Tensor, "3 H W"],
-        name: str,
+        index: int,
         learning: bool = False,
         edges: tuple[float, float, float, float] = WHOLE,
     ) -> Float[Tensor, "3 H W"]:
-        """The render as the photograph of that name would have it, on the device that learns; as it is where there are
-        no exposures. learning: the photograph is one of the step under way. edges: of what is rendered, as shares of
-        the photograph's sides."""
-        if self.matrices is None:
-            return image
-        index = self.names.index(name)
-        if learning:
-            self.shown.add(index)
-        matrix, grid = self.matrices[index], None if self.grids is None else self.grids[index]
-        out = transformed(image.to(self.device), matrix if learning else matrix.detach())
-        return out if grid is None else through_grid(out, grid if learning else grid.detach(), edges)
+        """Returns the render at the exposure of a photo, which there must be.
 
-    def rate(self, number: int) -> float:
-        """Of step `number`."""
-        own, first = self.options, round(self.options.start * self.iterations)
-        return log_linear(number - first, self.iterations - first, own.rate, own.rate_final)
+        edges: left, top, right, bottom of the render, as shares of the photo's sides.
+        """
+        assert self.matrices is not None
+        if learning:
+            self.rendered.add(index)
+        matrix, grid = self.matrices[index], None if self.grids is None else self.grids[index]
+        out = transform_colours(image.to(self.context.device), matrix if learning else matrix.detach())
+        return out if grid is None else apply_grid(out, grid if learning else grid.detach(), edges)
+
+    def rate(self, step: int) -> float:
+        """Returns the learning rate of a step."""
+        options, iterations = self.options, self.context.iterations
+        first = round(options.start * iterations)
+        return log_linear(step - first, iterations - first, options.rate, options.rate_final)
 
     @torch.no_grad()
-    def update(self, number: int) -> None:
-        """One step of Adam for each photograph that was shown; the mean of the matrices stays the identity, that of
-        grids zero."""
+    def optimizer_step(self, step: int) -> None:
+        """Take one step of Adam for each photo that was rendered; keep the mean exposure the identity."""
         if self.matrices is None or self.matrices.grad is None:
             return
         learnt = [(self.matrices, self.moments), (self.grids, self.grid_moments)]
-        for index in sorted(self.shown):
+        for index in sorted(self.rendered):
             self.visits[index] += 1
             for values, moments in learnt:
                 if values is not None and values.grad is not None:
                     direction = adam_direction(moments[:, index], values.grad[index], float(self.visits[index]))
-                    values[index] -= self.rate(number) * direction
+                    values[index] -= self.rate(step) * direction
         self.matrices.copy_(centred_on_identity(self.matrices))
         if self.grids is not None:
             self.grids.copy_(without_common(self.grids))
-        self.forget()
+        self.zero_grad()
 
-    def forget(self) -> None:
+    def zero_grad(self) -> None:
         """Drop the gradients of a step."""
-        self.shown.clear()
+        self.rendered.clear()
         for values in (self.matrices, self.grids):
             if values is not None:
                 values.grad = None
 
-    def tensors(self) -> dict[str, Tensor]:
-        """What a checkpoint holds of them; nothing where there are none."""
+    # -- files ---------------------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Returns exposures and Adam's state; empty where there are none."""
         if self.matrices is None:
             return {}
-        own = {"matrices": self.matrices.detach(), "moments": self.moments, "visits": self.visits}
-        own["told_last"] = torch.tensor(self.told_last)
-        return own if self.grids is None else own | {"grids": self.grids.detach(), "grid_moments": self.grid_moments}
+        tensors = {"matrices": self.matrices.detach(), "moments": self.moments, "visits": self.visits}
+        tensors["told_last"] = torch.tensor(self.last_estimate)
+        if self.grids is None:
+            return tensors
+        return tensors | {"grids": self.grids.detach(), "grid_moments": self.grid_moments}
 
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a checkpoint's tensors; none: there are no exposures."""
-        self.matrices, self.grids, self.told_last = None, None, 0
-        if tensors:
-            self.told_last = int(tensors.get("told_last", 0))  # not in checkpoints of earlier versions
-            grids = tensors.get("grids")
-            self.begin(tensors["matrices"].clone(), None if grids is None else grids.clone())
-            self.moments, self.visits = tensors["moments"].to(self.device).clone(), tensors["visits"].clone()
-            if grids is not None:
-                self.grid_moments = tensors["grid_moments"].to(self.device).clone()
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go on from a checkpoint; empty: there are no exposures."""
+        self.matrices, self.grids, self.last_estimate = None, None, 0
+        if not tensors:
+            return
+        self.last_estimate = int(tensors.get("told_last", 0))  # older checkpoints lack it
+        grids = tensors.get("grids")
+        self.start(tensors["matrices"].clone(), None if grids is None else grids.clone())
+        self.moments, self.visits = tensors["moments"].to(self.context.device).clone(), tensors["visits"].clone()
+        if grids is not None:
+            self.grid_moments = tensors["grid_moments"].to(self.context.device).clone()
+
+    def summary(self, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Returns when photos were tested, the spreads, how many are corrected, and the changes since."""
+        held = [line for line in lines if self.seconds_key in line]
+        if not held:
+            return {}
+        first = held[0]
+        figures = {"step": first["step"], "spread": first.get("exposure_spread"), "learnt": first["exposures"]}
+        figures["motions"] = [line["exposure_motion"] for line in held if "exposure_motion" in line]
+        figures["seconds"] = sum(line[self.seconds_key] for line in held)
+        grids = {"within": first["light_spread"], "grids": first["grids"]} if "light_spread" in first else {}
+        return {"exposures": figures | grids}
+
+    def remarks(self, evaluation: Mapping[str, Any]) -> Iterator[str]:
+        """Yields that photos have exposures, which the model has none of."""
+        figures = evaluation.get("exposures") or {}
+        if figures.get("learnt"):
+            spread = "differ" if figures["spread"] is None else f"are spread by {figures['spread']:.1%}"
+            yield (
+                f"exposures of photos {spread}, each has its own from step {figures['step']:,} on: the model has that "
+                "of the mean photo; eval.colours=fitted looks past that"
+            )
+        if figures.get("grids"):
+            yield (
+                f"light within photos is spread by {figures['within']:.1%}, each has a bilateral grid from step "
+                f"{figures['step']:,} on"
+            )
+
+
+def photo_pair(run: Run, view: View) -> Pair:
+    """Returns a reduced render at its photo's exposure, the photo, and the pixels that count.
+
+    Pixels that are light in the render at the model's exposure do not count: it is cut off there.
+    """
+    small, rendering = render_reduced(run, view, depth=False)
+    image = run.views.match_photo(rendering.image, None, small).detach().cpu()
+    below, mask = (rendering.image < LIGHT).all(0), small.counted()
+    return image, small.image(), below if mask is None else below & mask
+
+
+def log_test(module: Exposure, step: int, spread: float, within: float) -> dict[str, float]:
+    """Log the spreads that a test measured and what follows; returns them for the line of the step."""
+    options, active, grids = module.options, module.active, module.grids is not None
+    log_verdict(step, "exposure spread", spread, options.spread, "learning one per photo", active)
+    metrics = {"exposure_spread": spread, "exposures": module.count if active else 0}
+    if math.isnan(within):
+        return metrics
+    log_verdict(step, "light spread within photos", within, options.grid_spread, "learning grids", grids)
+    return metrics | {"light_spread": within, "grids": module.count if grids else 0}
+
+
+def log_verdict(step: int, what: str, value: float, threshold: float, action: str, active: bool) -> None:
+    """Log a test of a spread: its value, the threshold, and what follows."""
+    verdict = action if active else "photos are taken as equal"
+    sign = ">" if value > threshold else "<="
+    logger.info("step %d: %s %.1f %% %s %.1f %%, %s", step, what, 100 * value, sign, 100 * threshold, verdict)
 
 
 def adam_direction(moments: Float[Tensor, "2 *S"], gradient: Float[Tensor, "*S"], steps: float) -> Float[Tensor, "*S"]:
-    """Adam's, of one photograph's numbers at its step of that number; its moments are changed in place."""
+    """Returns Adam's direction for one photo at its step of that number; changes its moments in place."""
     means = []
     for moment, beta, value in zip(moments, BETAS, (gradient, gradient.square()), strict=True):
         moment.mul_(beta).add_((1 - beta) * value)
@@ -302,34 +356,6 @@ def adam_direction(moments: Float[Tensor, "2 *S"], gradient: Float[Tensor, "*S"]
     return means[0] / (means[1].sqrt() + EPS)
 
 
-def transformed(image: Float[Tensor, "3 H W"], matrix: Float[Tensor, "3 4"]) -> Float[Tensor, "3 H W"]:
-    """A [r, g, b, 1]^T of every pixel."""
-    return (matrix[:, :3] @ image.flatten(1)).view_as(image) + matrix[:, 3, None, None]
-
-
-def saturated(
-    image: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], exposures: Exposures
-) -> Float[Tensor, "3 H W"]:
-    """A render at the exposure of its photograph, where there are any: a saturated value says "at least 1", and more
-    is no error."""
-    if exposures.matrices is None:
-        return image
-    return torch.where((photograph >= 1) & (image > 1), photograph, image)
-
-
 def centred_on_identity(matrices: Float[Tensor, "N 3 4"]) -> Float[Tensor, "N 3 4"]:
-    """The matrices less what their mean is off the identity."""
+    """Returns the matrices with the identity as their mean."""
     return matrices - matrices.mean(0) + torch.eye(3, 4, device=matrices.device)
-
-
-# -- pictures that are judged ------------------------------------------------------------------------------------------
-
-
-def best_matrix(
-    image: Float[Tensor, "3 H W"], truth: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"]
-) -> Float[Tensor, "3 4"]:
-    """The matrix that brings the pixels that count closest to the truth, by least squares."""
-    counted = counted.to(image.device)
-    rows = torch.cat([image, torch.ones_like(image[:1])])[:, counted].double().T.cpu()
-    wanted = truth[:, counted].double().T.cpu()
-    return torch.linalg.lstsq(rows, wanted, driver="gelsd").solution.T.float().to(image.device)  # of lower rank: least

@@ -1,16 +1,16 @@
-"""Steps that would gain too little are left out: a run goes on with its last part where validation windows say so.
+"""Steps that would gain too little are skipped: a run goes on with its last part where validation windows say so.
 
-From `start` on, windows of some training views count in no loss while the number of steps grows by a tenth. They are
-drawn at both ends of these steps, and what their error differs by is the gain of the steps where nothing was learnt
-from the pixels themselves, told in dB per doubling of the steps, the unit of the price. Below the price the run goes on
-at `to`: with what its schedules do at the end (finer pixels, learning rates that go down). Windows move to other views
-and places with every such tenth. Test views play no part.
+From `start` on, windows of some training views enter no loss while the number of steps grows by a tenth. They are
+rendered at both ends of these steps. The difference of their errors is the gain of the steps where nothing was learnt
+from the pixels themselves, in dB per doubling of the steps: the unit of the price. Below the price the run goes on at
+`to`, with what its schedules do at the end (finer pixels, learning rates that decay). With every such tenth windows
+move to other views and places. Test views play no part.
 """
 
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
@@ -20,28 +20,32 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Float
+from gsx.core.training.backbone import Settling
+from gsx.core.training.importance import Probe
+from gsx.core.training.module import ModuleContext, TrainingModule
+from gsx.core.training.run import Run
 from gsx.core.training.validation import decibels, rounding_in, validation_windows
 
 logger = logging.getLogger(__name__)
 
-ONE_IN = 10
-"""Of so many steps another is taken before they are judged, if that is more than a pass over the views."""
+GROWTH = 10
+"""A test takes one more step for so many steps before, but at least a pass over the views."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlateauOptions:
-    """Options; values in conf/config.yaml."""
+    """Options; values in conf/module/plateau.yaml."""
 
     price: Annotated[float, Range(0, 100)] = 0.0
-    """dB that a doubling of the steps has to bring; 0: every step is taken."""
+    """dB that a doubling of the steps has to bring; 0: no step is skipped."""
     start: Share = 0.5
-    """Share of the steps before any are left out."""
+    """Share of the steps before any are skipped."""
     to: Share = 0.8
-    """Share of the steps that a run goes on from."""
+    """Share of the steps at which a run goes on."""
     views: Annotated[int, Range(1, 1000)] = 6
     """Training views that have a validation window at a time."""
     window: Annotated[float, Range(0.05, 1)] = 0.5
-    """Its sides as shares of the view's."""
+    """Sides of a window as shares of the view's sides."""
 
     def __post_init__(self) -> None:
         if self.price > 0 and not 0 < self.start < self.to:
@@ -50,109 +54,144 @@ class PlateauOptions:
                 "above 0, the first one smaller"
             )
 
-    def last_part(self, iterations: int) -> int:
-        """First step of the part of a run of so many steps that is never left out."""
-        return round(self.to * iterations)
 
-
-@dataclass(eq=False)
-class Plateau:
-    """What a run knows of the gain of its steps."""
+class Plateau(TrainingModule):
+    """Tests what the steps gain, and skips those that gain too little."""
 
     options: PlateauOptions
-    iterations: int
-    passing: int
-    """Steps of a pass over the training views."""
-    settled: int = 0
-    """Step after which nothing is due once that a run must not leave out."""
-    begun: int = 0
-    """Step after which the windows of the moment began; 0: there are none."""
-    before: Float[Tensor, "W"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
-    """Squared error in each of them at that time."""
-    found: Float[Tensor, "T 3"] = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.float64))
-    """Step, gain in dB per doubling of the steps, and its standard error, of each judgement."""
-    left_out: range = range(0)
-    """Numbers of the steps that were left out."""
 
-    @property
-    def first(self) -> int:
-        """Step after which the first windows begin."""
-        return max(1, round(self.options.start * self.iterations), self.settled)
+    def __init__(self, options: PlateauOptions, context: ModuleContext) -> None:
+        super().__init__(options, context)
+        self.one_pass = -(-len(context.scene.train) // context.batch)
+        """Steps of a pass over the training views."""
+        self.resume_at = round(options.to * context.iterations)
+        """Step that is taken next where the steps before it are skipped."""
+        self.test_start = 0
+        """Step after which the windows of the moment begin; 0: there are none."""
+        self.before: Float[Tensor, W] = torch.zeros(0, dtype=torch.float64)
+        """Squared error in each of the windows at that step."""
+        self.gains: Float[Tensor, "T 3"] = torch.zeros(0, 3, dtype=torch.float64)
+        """Step, gain in dB per doubling of the steps, and its standard error, of each test."""
+        self.skipped = range(0)
+        """Numbers of the steps that were skipped."""
 
-    @property
-    def last(self) -> int:
-        """Step that is taken next where the others before it are left out."""
-        return self.options.last_part(self.iterations)
+    # -- when ----------------------------------------------------------------------------------------------------------
 
-    def ends(self, begun: int) -> int:
-        """Step after which windows that began after a step are judged."""
-        return begun + max(math.ceil(begun / ONE_IN), self.passing)
+    def first_test(self, run: Run) -> int:
+        """Returns the step after which the first windows begin: nothing that happens once must be skipped."""
+        return max(1, round(self.options.start * self.context.iterations), last_milestone(run, self.resume_at))
 
-    @property
-    def open(self) -> bool:
-        """Whether there are windows, which this run is to judge: not those of a schedule that was another."""
-        return self.options.price > 0 and self.begun >= self.first
+    def test_end(self, start: int) -> int:
+        """Returns the step after which windows that began after a step are tested."""
+        return start + max(math.ceil(start / GROWTH), self.one_pass)
 
-    def judged_after(self, step: int) -> bool:
-        """Whether the windows of the moment are judged after this step."""
-        return self.open and step == self.ends(self.begun)
+    def testing(self, run: Run) -> bool:
+        """Returns whether there are windows, which belong to this schedule and not to one before `gsx resume`."""
+        return self.options.price > 0 and self.test_start > 0 and self.test_start >= self.first_test(run)
 
-    def begins_after(self, step: int) -> bool:
-        """Whether windows begin after this step: there are to be steps left that can be left out."""
-        due = self.options.price > 0 and step == (self.ends(self.begun) if self.open else self.first)
-        return due and self.ends(step) + 1 < self.last
+    def test_ends_after(self, run: Run, step: int) -> bool:
+        """Returns whether the windows of the moment are tested after this step."""
+        return self.testing(run) and step == self.test_end(self.test_start)
 
-    def windows(self, views: Sequence[View], begun: int) -> dict[View, Window]:
-        """Those that begin after a step."""
-        return validation_windows(views, self.options.views, self.options.window, "plateau", begun)
+    def test_starts_after(self, run: Run, step: int) -> bool:
+        """Returns whether windows begin after this step: there must be steps left to skip."""
+        if self.options.price == 0:
+            return False
+        due = self.test_end(self.test_start) if self.testing(run) else self.first_test(run)
+        return step == due and self.test_end(step) + 1 < self.resume_at
 
-    def window(self, views: Sequence[View], view: View, step: int) -> Window | None:
-        """The window of a view that counts in no loss at a step."""
-        if not (self.open and self.begun < step <= self.ends(self.begun)):
-            return None
-        return self.windows(views, self.begun).get(view)
+    # -- hooks ---------------------------------------------------------------------------------------------------------
 
-    def judge(self, windows: Mapping[View, Window], after: Float[Tensor, "W"], step: int) -> None:
-        """Find what the steps since the windows began have gained, if pixels of them count. There are no windows
-        then."""
-        floor, begun, before = rounding_in(windows), self.begun, self.before
-        self.begun, self.before = 0, before[:0]
-        if not bool(floor.any()):
-            return
-        gain, error = (value / math.log2(step / begun) for value in decibels(after + floor, before + floor))
-        self.found = torch.cat([self.found, torch.tensor([[step, gain, error]], dtype=torch.float64)])
-        told = step, gain, error, self.options.price, step - begun
-        logger.info("step %d: %.2f +- %.2f dB per doubling of the steps, price %.2f, by the last %d", *told)
-        if gain < self.options.price:
-            self.left_out = range(step + 1, self.last)
-            logger.info("step %d: the run goes on with step %d", step, self.last)
+    def before_step(self, run: Run) -> dict[str, float]:
+        """Test what the last steps have gained, if that is due, and skip steps if it is too little."""
+        done = run.step
+        ended = self.windows(run.views.at(done), self.test_start) if self.test_ends_after(run, done) else {}
+        started = self.windows(run.views.at(done + 1), done) if self.test_starts_after(run, done) else {}
+        after, before = errors_in(run, ended, done), errors_in(run, started, done + 1)  # nothing can fail from here on
+        if ended:
+            self.finish_test(ended, after, done)
+        if self.skipped and run.step + 1 in self.skipped:
+            run.step = self.resume_at - 1
+        elif started:
+            self.start_test(done, before)
+        return self.metrics_at(run.step + 1)
 
-    def begin(self, step: int, before: Float[Tensor, "W"]) -> None:
-        """Windows begin after this step, with these errors."""
-        self.begun, self.before = step, before
+    def ignored_windows(self, run: Run, view: View, step: int) -> Sequence[Window]:
+        """Returns the validation window of a view."""
+        if not (self.testing(run) and self.test_start < step <= self.test_end(self.test_start)):
+            return ()
+        window = self.windows(run.views.at(step), self.test_start).get(view)
+        return () if window is None else (window,)
 
-    def told_at(self, number: int) -> dict[str, float]:
-        """What was found, and left out, before a step; for its line."""
-        if not len(self.found) or number not in (int(self.found[-1, 0]) + 1, self.left_out.stop):
-            return {}
-        told = {"step_gain": float(self.found[-1, 1]), "step_price": self.options.price}
-        return told | ({"steps_left_out": len(self.left_out)} if number == self.left_out.stop else {})
-
-    def plan(self) -> dict[str, Any]:
-        """When steps may be left out, for the log and the report; nothing where none may."""
+    def plan(self, run: Run) -> dict[str, Any]:
+        """Returns when steps may be skipped."""
         if self.options.price == 0:
             return {}
-        return {"plateau": {"from": self.first, "to": self.last, "price_db_per_doubling": self.options.price}}
+        start = self.first_test(run)
+        return {"plateau": {"from": start, "to": self.resume_at, "price_db_per_doubling": self.options.price}}
 
-    def tensors(self) -> dict[str, Tensor]:
-        """What a checkpoint holds; nothing where no step has been judged, nor is."""
-        if not (self.begun or len(self.found)):
+    def state_dict(self) -> dict[str, Tensor]:
+        """Returns windows and gains, if there are any."""
+        if not (self.test_start or len(self.gains)):
             return {}
-        numbers = torch.tensor([self.begun, self.left_out.start, self.left_out.stop])
-        return {"numbers": numbers, "before": self.before, "found": self.found}
+        numbers = torch.tensor([self.test_start, self.skipped.start, self.skipped.stop])
+        return {"numbers": numbers, "before": self.before, "found": self.gains}
 
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a checkpoint's tensors."""
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go on from a checkpoint."""
         if tensors:
-            self.begun, start, stop = tensors["numbers"].tolist()
-            self.before, self.found, self.left_out = tensors["before"], tensors["found"], range(start, stop)
+            self.test_start, start, stop = tensors["numbers"].tolist()
+            self.before, self.gains, self.skipped = tensors["before"], tensors["found"], range(start, stop)
+
+    # -- tests ---------------------------------------------------------------------------------------------------------
+
+    def windows(self, views: Sequence[View], start: int) -> dict[View, Window]:
+        """Returns the validation windows that begin after a step."""
+        return validation_windows(views, self.options.views, self.options.window, "plateau", start)
+
+    def start_test(self, step: int, before: Float[Tensor, "W"]) -> None:
+        """Begin windows after a step, at which they have these errors."""
+        self.test_start, self.before = step, before
+
+    def finish_test(self, windows: Mapping[View, Window], after: Float[Tensor, "W"], step: int) -> None:
+        """Compute the gain since the windows began, if pixels of them count, and skip steps if it is below the price.
+
+        There are no windows then.
+        """
+        rounding, start, before = rounding_in(windows), self.test_start, self.before
+        self.test_start, self.before = 0, before[:0]
+        if not bool(rounding.any()):
+            return
+        gain, error = (value / math.log2(step / start) for value in decibels(after + rounding, before + rounding))
+        self.gains = torch.cat([self.gains, torch.tensor([[step, gain, error]], dtype=torch.float64)])
+        price = self.options.price
+        verdict = f"skipping to step {self.resume_at}" if gain < price else "going on"
+        sign = "<" if gain < price else ">="
+        logger.info(
+            "step %d: gain %.2f +- %.2f dB per doubling of the steps, over the last %d, %s price %.2f: %s",
+            *(step, gain, error, step - start, sign, price, verdict),
+        )
+        if gain < price:
+            self.skipped = range(step + 1, self.resume_at)
+
+    def metrics_at(self, step: int) -> dict[str, float]:
+        """Returns the gain that was computed, and the number of steps skipped, just before a step."""
+        if not len(self.gains) or step not in (int(self.gains[-1, 0]) + 1, self.skipped.stop):
+            return {}
+        metrics = {"step_gain": float(self.gains[-1, 1]), "step_price": self.options.price}
+        return metrics | ({"steps_left_out": len(self.skipped)} if step == self.skipped.stop else {})
+
+
+def last_milestone(run: Run, before: int) -> int:
+    """Returns the last step at which modules or backbone do something once, before a step."""
+    steps = list(run.backbone.settles()) if isinstance(run.backbone, Settling) else []
+    steps += [step for module in run.modules.values() for step in module.milestones()]
+    return max((step for step in steps if step < before), default=0)
+
+
+def errors_in(run: Run, windows: Mapping[View, Window], step: int) -> Float[Tensor, "W"]:
+    """Returns the squared error in each validation window, by the rules of a step; the same on all ranks."""
+    if not windows:
+        return torch.zeros(0, dtype=torch.float64)
+    probe = Probe(model=run.backbone, views=run.views, step=run.model_step, raster_step=step)
+    return run.ranks.broadcast(lambda: probe.window_errors(windows).cpu())

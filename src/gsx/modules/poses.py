@@ -1,168 +1,223 @@
-"""Poses of training photographs, corrected beside the model where they are found to be wrong.
+"""Poses of training photos, corrected with the model where they are found to be wrong.
 
-Structure from motion, or whoever wrote the poses down, may be off by a pixel: then photographs pull at the model in
-different directions, and it becomes blurred. Whether they are is judged once: what left and right halves of photographs
-have in common of the shifts by which they lie beside the model's renders (`modules.shifts`). If so, each pose is
-moved to where its photograph was taken by the model's word (`modules.alignment`), a few times, while the model
-goes on learning from poses that are better each time. What all motions have in common moves the world and no
-photograph: it is taken from them again. Test photographs play no part.
+Structure from motion, or whoever wrote the poses down, may be off by a pixel: then photos pull the model apart, and it
+becomes blurred. One test decides whether they are: the spread of shifts between photos and renders
+that the left and right halves of photos share (`modules.shifts`). If so, each pose moves to where the model says that
+its photo was taken (`modules.alignment`), a few times, while the model goes on learning from better poses. What all
+motions have in common moves the world and no photo: it is taken out again. Test photos play no part.
 """
 
+import logging
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Annotated
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
+from gsx.core.data.coarser import coarser
 from gsx.core.data.scene import View
 from gsx.core.gaussians.turned import cross_matrix
-from gsx.core.ranges import Range, Share
+from gsx.core.ranges import Range
 from gsx.core.shapes import Bool, Float
-from gsx.modules.alignment import Motion, motion_to, rotation_by
-from gsx.modules.exposure import shared_spread
-from gsx.modules.occasions import MadeOf, due_at, occasions, refuse_wrong, some_photographs
+from gsx.core.training.module import ModuleContext
+from gsx.core.training.render import render
+from gsx.core.training.run import Run
+from gsx.modules.alignment import Motion, aligned, motion_to, rotation_by, usual_depth
+from gsx.modules.corrections import Correction, CorrectionOptions, Times, ViewCache, ViewCount, sample
+from gsx.modules.photo_pairs import REDUCTION, render_reduced, shared_spread
 from gsx.modules.pinned import posed
 from gsx.modules.shifts import shift_of
 
+logger = logging.getLogger(__name__)
+
 CORRELATED_PIXELS = 250
-"""Of a photograph, about 16 x 16: neighbours differ by the same errors of the model, and say as much as one of them."""
-LEAST_ERROR = 0.5
-"""Px of a photograph by which a pose is expected to be wrong, at least (standard deviation)."""
+"""Pixels of a photo, about 16 x 16, that share the errors of the model: together they say as much as one."""
+MIN_ERROR = 0.5
+"""Smallest expected error of a pose, px of a photo (standard deviation)."""
 MEDIAN_SQUARE = 0.4549
-"""Of normally distributed numbers of variance 1."""
+"""Median of the square of a standard normal variable."""
+MIN_PIXELS = 1 << 13
+"""Poses are estimated from views of at least so many pixels: small photos are not reduced."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseOptions:
-    """Options; values in conf/config.yaml."""
+class PoseOptions(CorrectionOptions):
+    """Options; values in conf/module/poses.yaml."""
 
-    when: str = "never"
-    """auto: where photographs lie beside what the model shows."""
-    start: Share = 0.2
-    """Share of the steps after which that is judged, and poses are corrected first."""
-    until: Share = 0.7
-    """Share of the steps after which they are corrected last."""
-    times: Annotated[int, Range(1, 1000)] = 7
-    """How often they are, at shares that grow by the same factor: a model that knows little yet gives way soonest."""
+    key: ClassVar[str] = "poses"
+    times: Times = 7
+    """Number of corrections, at shares that grow by the same factor: a model that knows little gives way soonest."""
     spread: Annotated[float, Range(0, 100)] = 0.12
-    """`auto`: px of shifts (standard deviation along an axis), from which on poses are corrected."""
-    views: Annotated[int, Range(3, 10**6)] = 24
-    """Photographs that are judged by, at most."""
-
-    def __post_init__(self) -> None:
-        refuse_wrong("poses", self)
+    """`auto`: standard deviation of shifts along an axis, px, above which poses are corrected."""
+    views: ViewCount = 24
+    """Most photos that the test uses."""
 
 
-@dataclass(eq=False)
-class Poses:
-    """Of a run's training photographs. No pose is another than the scene's before `correct`."""
+class Poses(Correction):
+    """Poses of a run's training photos; those of the scene before the first correction."""
 
-    options: PoseOptions = field(default_factory=PoseOptions)
-    cameras: Sequence[Camera] = ()
-    """The scene's, in order."""
-    iterations: int = 0
-    matrices: Float[Tensor, "N 3 4"] | None = None
-    """camera_from_world, rotation and translation; None: those of the scene."""
-    error: float = math.nan
-    """Px by which the prior of the last correction took the scene's poses to be wrong, standard deviation."""
-    corrected: int = 0
-    """The last step before which they were: not again where that step is taken anew."""
-    seen: MadeOf = field(default_factory=MadeOf)
-    """Views that were asked for, and what they are by the poses of the moment."""
+    options: PoseOptions
+    seconds_key = "pose_seconds"
 
-    def steps(self) -> list[int]:
-        """The steps before which poses are corrected, if they are, the first of them after that is judged; none where
-        nobody asks."""
-        return occasions(self.options, self.iterations)
+    def __init__(self, options: PoseOptions, context: ModuleContext) -> None:
+        super().__init__(options, context)
+        self.matrices: Float[Tensor, "N 3 4"] | None = None
+        """camera_from_world, rotation and translation; None: those of the scene."""
+        self.error = math.nan
+        """Error of the scene's poses that the last correction expected, px, standard deviation."""
+        self.cache = ViewCache()
 
-    def due(self, number: int) -> bool:
-        """Whether they are judged or corrected before this step."""
-        return due_at(number, self.steps(), self.corrected, self.matrices is not None)
+    @property
+    def active(self) -> bool:
+        """Whether poses are corrected."""
+        return self.matrices is not None
 
-    def judged_by(self, views: Sequence[View]) -> list[View]:
-        """The photographs that they are judged by: the same in every run."""
-        return some_photographs(views, self.options.views, "poses")
+    def restarted(self, context: ModuleContext) -> "Poses":
+        """Returns a module that corrects nothing: the other run gets views with corrected poses."""
+        return Poses(PoseOptions(), context)
 
-    def needed(self, spread: float) -> bool:
-        """Whether a spread of shifts, px, asks for corrections."""
-        return self.options.when == "always" or spread > self.options.spread
-
-    def expected_error(self, number: int, usual: float) -> float:
-        """Px by which the prior of a correction takes the scene's poses to be wrong: as many as is usual at the first
-        one, then ever fewer by the same factor, LEAST_ERROR at the last one. Held loosely those that are far off come
-        near; held firmly the small errors of each correction do not add up. A run that goes on longer holds them no
-        less."""
-        if self.matrices is None:
-            return max(LEAST_ERROR, usual)  # which may be nan
-        steps = self.steps()
-        left = len(steps) - 1 - steps.index(number)
-        return LEAST_ERROR * max(1.0, self.error / LEAST_ERROR) ** (left / (left + 1))
-
-    # -- what others see -----------------------------------------------------------------------------------------------
-
-    def views(self, views: Sequence[View]) -> Sequence[View]:
-        """The training views, in order, by the poses of the moment; the same ones until these change."""
+    def transform_views(self, views: Sequence[View], step: int | None) -> Sequence[View]:
+        """Returns the views with corrected poses."""
         if self.matrices is None:
             return views
         pairs = zip(views, self.matrices, strict=True)
-        return self.seen.views(views, lambda: [posed(view, at(view.camera, matrix)) for view, matrix in pairs])
+        return self.cache.get(views, lambda: [posed(view, with_pose(view.camera, matrix)) for view, matrix in pairs])
 
-    # -- what changes them ---------------------------------------------------------------------------------------------
+    # -- estimates -----------------------------------------------------------------------------------------------------
+
+    def estimate(self, run: Run, step: int) -> dict[str, float]:
+        """Test whether poses are wrong, where that is due first, and correct them if so."""
+        views, usual, metrics = run.train_views, math.nan, dict[str, float]()
+        if not self.active:
+            halves = half_shifts(photo_pairs(run, sample(views, self.options.views, "poses")))
+            metrics["pose_spread"], usual = shift_spread(halves), usual_shift(halves)
+            if not self.wrong(metrics["pose_spread"], step):
+                return metrics | {"poses": 0}
+        metrics["poses"], metrics["pose_motion"] = len(views), self.align(run, views, usual, step)
+        logger.info("step %d: poses refined, RMS motion %.2f px", step, metrics["pose_motion"])
+        return metrics
+
+    def wrong(self, spread: float, step: int) -> bool:
+        """Returns whether poses need correction, by the spread of shifts, px; logs it."""
+        above = spread > self.options.spread
+        wrong = above or self.options.when == "always"
+        sign, verdict = ">" if above else "<=", "refining poses" if wrong else "poses kept"
+        logger.info("step %d: pose error %.2f px %s %.2f px, %s", step, spread, sign, self.options.spread, verdict)
+        return wrong
+
+    def align(self, run: Run, views: Sequence[View], usual: float, step: int) -> float:
+        """Move each photo to where the model says that it was taken; returns the RMS motion, px.
+
+        usual: the usual shift between photos and renders, px; nan: unknown.
+        """
+        after, depths, error = list[Camera](), list[float](), self.expected_error(step, usual)
+        held = CORRELATED_PIXELS / error**2
+        for view, scene_view in zip(views, self.context.scene.train, strict=True):
+            small, rendering = render_reduced(run, view, min_pixels=MIN_PIXELS)
+            assert rendering.depth is not None
+            pictures = rendering.image, rendering.depth, rendering.alpha, small.image(), small.counted()
+            after.append(aligned(small.camera, *pictures, given=scene_view.camera, held=held))
+            depths.append(usual_depth(rendering.depth, rendering.alpha))
+        known = [depth for depth in depths if math.isfinite(depth)]
+        depth = median(known) if known else run.scene.extent
+        return self.correct([view.camera for view in views], after, depth, step, error)
+
+    def expected_error(self, step: int, usual: float) -> float:
+        """Returns the error of the scene's poses that the prior of a correction expects, px.
+
+        It is the usual shift at the first correction and shrinks by the same factor to MIN_ERROR at the last one. Held
+        loosely, photos that are far off come near; held firmly, the small errors of each correction do not add up. A
+        run that goes on longer holds them no less.
+        """
+        if self.matrices is None:
+            return max(MIN_ERROR, usual)  # which may be nan
+        steps = self.milestones()
+        left = len(steps) - 1 - steps.index(step)
+        return MIN_ERROR * max(1.0, self.error / MIN_ERROR) ** (left / (left + 1))
 
     def correct(
-        self, before: Sequence[Camera], after: Sequence[Camera], depth: float, number: int, error: float
+        self, before: Sequence[Camera], after: Sequence[Camera], depth: float, step: int, error: float
     ) -> float:
-        """Move each pose from one camera to another before a step, less what all motions have in common; returns how
-        far pictures move by that, px (root of the mean square). depth: at which moves are weighed against turns, scene
-        units; error: what the prior expected (`expected_error`)."""
+        """Move each pose from one camera to another, less the common motion; returns the RMS motion, px.
+
+        depth: scene units, at which moves are weighed against turns. error: what the prior expected, px.
+        """
         after = without_common(before, after, depth)
         self.take(torch.stack([torch.cat([c.rotation, c.translation[:, None]], 1).double() for c in after]))
-        self.corrected, self.error = number, error
-        steps = torch.stack([in_px(b, a, depth) for b, a in zip(before, after, strict=True)])
-        return math.sqrt(float(steps.square().sum(1).mean()))
+        self.last_estimate, self.error = step, error
+        motions = torch.stack([motion_px(b, a, depth) for b, a in zip(before, after, strict=True)])
+        return math.sqrt(float(motions.square().sum(1).mean()))
 
     def take(self, matrices: Float[Tensor, "N 3 4"] | None) -> None:
-        """These from now on."""
-        self.matrices, self.seen = matrices, MadeOf()
+        """Use these poses from now on."""
+        self.matrices, self.cache = matrices, ViewCache()
 
-    def tensors(self) -> dict[str, Tensor]:
-        """What a checkpoint holds of them; nothing where they are the scene's."""
+    # -- files ---------------------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Returns the corrected poses; empty where there are none."""
         if self.matrices is None:
             return {}
         error = torch.tensor(self.error, dtype=torch.float64)
-        return {"matrices": self.matrices, "corrected": torch.tensor(self.corrected), "error": error}
+        return {"matrices": self.matrices, "corrected": torch.tensor(self.last_estimate), "error": error}
 
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from a checkpoint's tensors; none: poses are the scene's."""
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go on from a checkpoint; empty: poses are the scene's."""
         self.take(tensors["matrices"].clone() if tensors else None)
-        self.corrected = int(tensors["corrected"]) if tensors else 0
-        self.error = float(tensors.get("error", math.nan))  # nothing is known of it in older checkpoints
+        self.last_estimate = int(tensors["corrected"]) if tensors else 0
+        self.error = float(tensors.get("error", math.nan))  # older checkpoints lack it
+
+    def summary(self, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Returns when poses were tested, the spread of shifts, how many are corrected, and the motions."""
+        held = [line for line in lines if self.seconds_key in line]
+        if not held:
+            return {}
+        figures = {"step": held[0]["step"], "spread": held[0].get("pose_spread"), "corrected": held[0]["poses"]}
+        figures["motions"] = [line["pose_motion"] for line in held if "pose_motion" in line]
+        return {"poses": figures | {"seconds": sum(line[self.seconds_key] for line in held)}}
+
+    def remarks(self, evaluation: Mapping[str, Any]) -> Iterator[str]:
+        """Yields that training poses are corrected, and test poses are not."""
+        figures = evaluation.get("poses") or {}
+        if figures.get("corrected"):
+            error = "off" if figures["spread"] is None else f"off by {figures['spread']:.2f} px"
+            yield (
+                f"poses of training photos were {error}, they are corrected from step {figures['step']:,} on: those of "
+                "test views are the scene's; eval.poses=aligned looks past that"
+            )
 
 
-# -- are they wrong? ---------------------------------------------------------------------------------------------------
+def photo_pairs(run: Run, views: Sequence[View]) -> Iterator[tuple[Tensor, Tensor, Tensor | None, float]]:
+    """Yields (render, photo, pixels that count, px of the photo per pixel) of reduced views."""
+    for view in views:
+        run.refuse_if_stopping()
+        small = coarser(view, run.scene.reduction, REDUCTION)
+        image = render(run, small.camera).image
+        yield image, small.image(), small.counted(), view.camera.focal / small.camera.focal
 
 
-def shifts_by_half(
-    pictures: Iterable[tuple[Tensor, Tensor, Bool[Tensor, "H W"] | None, float]],
+# -- test --------------------------------------------------------------------------------------------------------------
+
+
+def half_shifts(
+    pairs: Iterable[tuple[Tensor, Tensor, Bool[Tensor, "H W"] | None, float]],
 ) -> Float[Tensor, "N 2 2"]:
-    """How far to the right and down the left and the right half of each photograph lie beside its render, px; nan where
-    nothing tells. Pictures are renders, photographs, which pixels count, and px of a photograph in one of theirs."""
-    found = [[of_half(*picture, right) for right in (False, True)] for picture in pictures]
-    return torch.tensor(found, dtype=torch.float64)
+    """Returns shifts of both halves of each photo from its render, to the right and down, px; nan: unknown."""
+    shifts = [[half_shift(*pair, right) for right in (False, True)] for pair in pairs]
+    return torch.tensor(shifts, dtype=torch.float64)
 
 
-def spread_of_shifts(halves: Float[Tensor, "N 2 2"]) -> float:
-    """Px by which photographs lie beside renders, standard deviation along an axis: what left and right halves have in
-    common; 0 where too few tell."""
+def shift_spread(halves: Float[Tensor, "N 2 2"]) -> float:
+    """Returns the spread of shifts that both halves share, px, standard deviation along an axis; 0: too few known."""
     return shared_spread(halves[:, 0], halves[:, 1])
 
 
 def usual_shift(halves: Float[Tensor, "N 2 2"]) -> float:
-    """The same by the median over photographs and axes, which a few that lie far beside hardly change; 0 where that is
-    negative, or nothing tells."""
+    """Returns the spread by the median over photos and axes, which a few that are far off hardly change; px."""
     known = halves[halves.isfinite().all(2).all(1)]
     if not len(known):
         return 0.0
@@ -170,60 +225,59 @@ def usual_shift(halves: Float[Tensor, "N 2 2"]) -> float:
     return math.sqrt(max(0.0, float((left * right).median())) / MEDIAN_SQUARE)
 
 
-def of_half(
+def half_shift(
     image: Float[Tensor, "3 H W"],
-    photograph: Float[Tensor, "3 H W"],
-    counted: Bool[Tensor, "H W"] | None,
+    photo: Float[Tensor, "3 H W"],
+    mask: Bool[Tensor, "H W"] | None,
     px: float,
     right: bool,
 ) -> tuple[float, float]:
-    """How far to the right and down half a photograph lies beside half a render, each px of which is so many; nan where
-    nothing tells."""
+    """Returns the shift to the right and down of half a photo from half its render; px: of the photo per pixel."""
     middle = image.shape[2] // 2
     part = slice(middle, None) if right else slice(middle)
-    found = shift_of(image[..., part], photograph[..., part], None if counted is None else counted[..., part])
-    return (math.nan, math.nan) if found is None else (px * found[0], px * found[1])
-
-
-def at(camera: Camera, matrix: Float[Tensor, "3 4"]) -> Camera:
-    """The camera at a pose camera_from_world."""
-    rotation, translation = matrix[:, :3].to(camera.rotation), matrix[:, 3].to(camera.translation)
-    return replace(camera, rotation=rotation, translation=translation)
+    shift = shift_of(image[..., part], photo[..., part], None if mask is None else mask[..., part])
+    return (math.nan, math.nan) if shift is None else (px * shift[0], px * shift[1])
 
 
 # -- motions of cameras ------------------------------------------------------------------------------------------------
 
 
-def units(camera: Camera, depth: float) -> Float[Tensor, "6"]:
-    """Px by which what lies at a depth moves on the screen per rad and per scene unit."""
+def with_pose(camera: Camera, matrix: Float[Tensor, "3 4"]) -> Camera:
+    """Returns the camera at a pose camera_from_world."""
+    rotation, translation = matrix[:, :3].to(camera.rotation), matrix[:, 3].to(camera.translation)
+    return replace(camera, rotation=rotation, translation=translation)
+
+
+def px_per_unit(camera: Camera, depth: float) -> Float[Tensor, "6"]:
+    """Returns how far what lies at a depth moves on the screen per rad and per scene unit, px."""
     return camera.focal * torch.tensor([1.0] * 3 + [1 / depth] * 3, dtype=torch.float64)
 
 
-def in_px(before: Camera, after: Camera, depth: float) -> Float[Tensor, "6"]:
-    """A motion in px."""
-    return units(before, depth) * motion_to(before, after).twist()
+def motion_px(before: Camera, after: Camera, depth: float) -> Float[Tensor, "6"]:
+    """Returns a motion in px."""
+    return px_per_unit(before, depth) * motion_to(before, after).twist()
 
 
-def by_world(camera: Camera) -> Float[Tensor, "6 6"]:
-    """How a camera's frame moves with the world: the adjoint of its pose."""
+def adjoint(camera: Camera) -> Float[Tensor, "6 6"]:
+    """Returns how a camera's frame moves with the world: the adjoint of its pose."""
     rotation, across = camera.rotation.double(), cross_matrix(camera.translation.double())
     upper = torch.cat([rotation, torch.zeros_like(rotation)], 1)
     return torch.cat([upper, torch.cat([across @ rotation, rotation], 1)])
 
 
 def without_common(before: Sequence[Camera], after: Sequence[Camera], depth: float) -> list[Camera]:
-    """Cameras after their motions, with the world moved back by what these have in common: least squares in px."""
+    """Returns cameras after their motions, the world moved back by their common motion: least squares in px."""
     pairs = list(zip(before, after, strict=True))
-    columns = torch.cat([units(b, depth)[:, None] * by_world(b) for b, _ in pairs])
-    wanted = torch.cat([in_px(b, a, depth) for b, a in pairs])
-    world = torch.linalg.lstsq(columns, wanted[:, None], driver="gelsd").solution[:, 0]
+    columns = torch.cat([px_per_unit(b, depth)[:, None] * adjoint(b) for b, _ in pairs])
+    motions = torch.cat([motion_px(b, a, depth) for b, a in pairs])
+    world = torch.linalg.lstsq(columns, motions[:, None], driver="gelsd").solution[:, 0]
     turn = rotation_by(world[:3])
     back = Motion(rotation=turn.T, move=-turn.T @ world[3:])
     return [in_moved_world(camera, back) for camera in after]
 
 
 def in_moved_world(camera: Camera, motion: Motion) -> Camera:
-    """The camera that sees a moved world as the camera sees it: its pose after the motion."""
+    """Returns the camera that sees a moved world as the camera sees it: its pose after the motion."""
     rotation, translation = camera.rotation.double(), camera.translation.double()
     return replace(
         camera,

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
+from gsx.modules.captures import at_exposure, gains_between
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
-from gsx.modules.captures import at_exposure, gains_between
 from gsx.modules.distractor_masks import (
     ALIKE,
     BLOCK,

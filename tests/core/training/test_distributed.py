@@ -167,7 +167,13 @@ def test_two_processes_equal_one_and_resume_as_one(forking: Any, tmp_path: Path)
 def test_two_processes_judge_as_one(forking: Any, tmp_path: Path) -> None:
     """Growth that has to pay for itself, coarse pictures first, bands of colour judged: what the first finds holds."""
     judged = ("backbone.capacity=adaptive", "backbone.adaptive.price=0.01", "backbone.sh_judged=0.6")
-    coarse = ("iterations=26", "scene.width=64", "scene.height=48", "training.coarse=2", "training.coarse_until=0.4")
+    coarse = (
+        "iterations=26",
+        "scene.width=64",
+        "scene.height=48",
+        "training.coarse_to_fine.factor=2",
+        "training.coarse_to_fine.until=0.4",
+    )
     words = (*OVERRIDES, *COMMON, "backbone.density.every=2500", *judged, *coarse)
     two = both(forking, tmp_path / "said", *words, f"folder={tmp_path / 'two'}")
     assert two.returncode == 0, two.stderr

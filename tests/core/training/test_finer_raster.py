@@ -58,7 +58,7 @@ def fresh(folder: Path, *more: str) -> Run:
 
 
 def test_what_is_compared_and_looked_at_is_the_reduced_picture(tmp_path: Path) -> None:
-    run = fresh(tmp_path, "training.supersample=2")
+    run = fresh(tmp_path, "training.supersampling.factor=2")
     camera = run.scene.train[0].camera
     drawn, rendering = render_for_training(run, camera, 1, run.background)
     fine = rasterize(drawn.splats, camera.zoom(2), run.raster, background=run.background).image
@@ -176,7 +176,7 @@ def test_pictures_go_on_as_they_were_where_renders_become_finer() -> None:
 
 def test_one_is_the_published_loop_bit_for_bit_and_two_is_another_run(tmp_path: Path) -> None:
     words = ("iterations=30", "rasterizer=eager", "backbone=mip_splatting")
-    runs = {k: tiny_run(tmp_path / str(k), [*words, f"training.supersample={k}"]) for k in (1, 2)}
+    runs = {k: tiny_run(tmp_path / str(k), [*words, f"training.supersampling.factor={k}"]) for k in (1, 2)}
     plain = tiny_run(tmp_path / "plain", words)
     assert torch.equal(runs[1].backbone.table["means"], plain.backbone.table["means"])
     assert not torch.equal(runs[2].backbone.table["means"], plain.backbone.table["means"])
@@ -184,7 +184,7 @@ def test_one_is_the_published_loop_bit_for_bit_and_two_is_another_run(tmp_path: 
 
 def test_it_is_evaluated_as_it_was_trained_unless_told(tmp_path: Path) -> None:
     """And resumed as if it had never stopped."""
-    words = ("iterations=24", "rasterizer=eager", "backbone=mip_splatting", "training.supersample=2")
+    words = ("iterations=24", "rasterizer=eager", "backbone=mip_splatting", "training.supersampling.factor=2")
     whole = tiny_run(tmp_path / "whole", words)
     tiny_run(tmp_path / "cut", words, stop_after=11)
     again, settings = open_run(tmp_path / "cut", plugins(), training=True)
@@ -200,6 +200,9 @@ def test_it_is_evaluated_as_it_was_trained_unless_told(tmp_path: Path) -> None:
 
 
 def test_values_that_mean_nothing_are_refused(tmp_path: Path) -> None:
-    for word, message in (("training.supersample=0", "training.supersample is 0"), ("eval.supersample=-1", "-1")):
+    for word, message in (
+        ("training.supersampling.factor=0", "training.supersampling.factor is 0"),
+        ("eval.supersample=-1", "-1"),
+    ):
         with pytest.raises(ConfigError, match=message):
             tiny_settings(tmp_path, word)

@@ -66,7 +66,9 @@ def test_what_ssim_takes_of_a_photograph_is_found_once_while_there_is_room(monke
     assert photographs.moments_of(views[2], pictures[2], compiled=False) is not None
 
 
-@pytest.mark.parametrize("words", [(), ("training.coarse=2", "training.poses.when=always", "training.poses.times=2")])
+@pytest.mark.parametrize(
+    "words", [(), ("training.coarse_to_fine.factor=2", "training.poses.when=always", "training.poses.times=2")]
+)
 def test_training_is_the_same_whether_there_is_room_or_not(
     words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

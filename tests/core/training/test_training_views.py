@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from module_contexts import build_module, coarse_modules
 from small_scene import Grey, published_options, small_context, small_gs3d, small_scene, spread
 from tiny import final_tensors, tiny_run, tiny_settings
 from torch import Tensor
@@ -22,6 +23,7 @@ from gsx.core.training.run import Run, StepResult
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
+from gsx.modules.coarse_to_fine import CoarseToFine, CoarseToFineOptions
 
 
 class Noise:
@@ -46,10 +48,13 @@ def noisy(width: int = 131, height: int = 99) -> View:
 
 
 def test_halved_in_equal_times() -> None:
-    steps = TrainingViews(scene=small_scene(spread(1)), coarse=4, coarse_until=40)
-    assert [steps.coarse_at(step) for step in (0, 1, 20, 21, 40, 41, 1000)] == [4, 4, 4, 2, 2, 1, 1]
+    scene = small_scene(spread(1))
+    module = build_module(CoarseToFine, CoarseToFineOptions(factor=4, until=0.04), scene=scene)
+    assert [module.factor_at(step) for step in (0, 1, 20, 21, 40, 41, 1000)] == [4, 4, 4, 2, 2, 1, 1]
+    steps = TrainingViews(scene=scene, modules={"coarse_to_fine": module})
     assert [step for step in range(60) if steps.changes_after(step)] == [20, 40]
-    assert [TrainingViews(scene=steps.scene).coarse_at(step) for step in (1, 5)] == [1, 1]
+    plain = build_module(CoarseToFine, CoarseToFineOptions(until=0.04), scene=scene)
+    assert [plain.factor_at(step) for step in (1, 5)] == [1, 1]
 
 
 def test_a_coarser_view_shows_the_same_with_every_pixel_a_mean_of_a_block() -> None:
@@ -79,7 +84,7 @@ def test_windows_that_are_judged_by_lie_at_the_same_place_of_coarser_views() -> 
     scene = replace(small_scene(spread(1)), train=[View(f"v{i}", c, Grey()) for i, c in enumerate(cameras)])
     found = []
     for coarse in (1, 2):
-        context = small_context(scene, coarse=coarse, coarse_until=50 if coarse > 1 else 0)
+        context = small_context(scene, modules=coarse_modules(scene, coarse, 50 if coarse > 1 else 0))
         judge = Adaptive(AdaptiveOptions(views=3), context, Growing(0, 100, 10), 0)
         found.append({view.name: window for view, window in judge.windows(20).items()})
     assert found[0].keys() == found[1].keys()
@@ -96,7 +101,7 @@ def test_the_3d_filter_is_that_of_what_is_seen_and_the_picture_goes_on_as_it_was
     scene = replace(scene, train=wide)
     options = replace(published_options(), filter="mip")
     one = small_gs3d(scene, options=options)
-    two = small_gs3d(scene, options=options, iterations=100, coarse=2, coarse_until=60)
+    two = small_gs3d(scene, options=options, iterations=100, modules=coarse_modules(scene, 2, 60))
     assert torch.allclose(two.table["filter"], 2 * one.table["filter"])
     camera = scene.train[0].camera
     before, sizes = two.draw(camera, 60).splats, two.table["filter"].clone()
@@ -118,7 +123,13 @@ class Sizes:
         self.seen.append(tuple(step.target.shape[1:]))
 
 
-WORDS = ["scene.width=128", "scene.height=96", "iterations=24", "training.coarse=2", "training.coarse_until=0.5"]
+WORDS = [
+    "scene.width=128",
+    "scene.height=96",
+    "iterations=24",
+    "training.coarse_to_fine.factor=2",
+    "training.coarse_to_fine.until=0.5",
+]
 
 
 def test_a_run_sees_coarse_pictures_first_and_goes_on_bit_for_bit(tmp_path: Path) -> None:
@@ -138,10 +149,12 @@ def test_a_run_sees_coarse_pictures_first_and_goes_on_bit_for_bit(tmp_path: Path
 
 def test_of_1_nothing_changes(tmp_path: Path) -> None:
     plain = tiny_run(tmp_path / "plain", ["iterations=8"])
-    one = tiny_run(tmp_path / "one", ["iterations=8", "training.coarse=1", "training.coarse_until=0.5"])
+    one = tiny_run(
+        tmp_path / "one", ["iterations=8", "training.coarse_to_fine.factor=1", "training.coarse_to_fine.until=0.5"]
+    )
     assert torch.equal(plain.backbone.table["means"], one.backbone.table["means"])
 
 
 def test_what_is_no_power_of_two_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"training.coarse is 3; give a power of two, for example 2"):
-        tiny_settings(tmp_path, "training.coarse=3")
+    with pytest.raises(ConfigError, match=r"training.coarse_to_fine.factor is 3; give a power of two, for example 2"):
+        tiny_settings(tmp_path, "training.coarse_to_fine.factor=3")

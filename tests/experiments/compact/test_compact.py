@@ -212,7 +212,7 @@ def test_a_budget_that_nothing_meets_leaves_the_model_as_it_was(shrinking: Shrin
 
 def test_a_try_knows_nothing_of_the_others_exposures(folder: Path) -> None:
     run = opened(folder)
-    run.exposures.begin(torch.eye(3, 4).repeat(len(run.train_views), 1, 1))
+    run.modules["exposure"].start(torch.eye(3, 4).repeat(len(run.train_views), 1, 1))
     tried = Shrinking(run, ShrinkOptions(max_drop=0.0, steps=2, zooms=(1.0,)), plugins(), generator())
     drops = []
     for share in (0.25, 0.5, 0.25):
@@ -220,7 +220,9 @@ def test_a_try_knows_nothing_of_the_others_exposures(folder: Path) -> None:
         drops.append(tried.attempt(share, tried.untouched.degree, False).drop)
     assert drops[0] == drops[2]
     tried.take(tried.untouched)
-    assert torch.equal(run.exposures.tensors()["matrices"], torch.eye(3, 4).repeat(len(run.train_views), 1, 1))
+    assert torch.equal(
+        run.modules["exposure"].state_dict()["matrices"], torch.eye(3, 4).repeat(len(run.train_views), 1, 1)
+    )
 
 
 def with_drops(shrinking: Shrinking, drops: dict[int, float], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,8 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.training_views import TrainingViews
-from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator, evenly
+from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.evaluator import Evaluator, evenly
 from gsx.experiments.evaluation.lpips import LpipsOptions
 
 SIZE = (24, 16)
@@ -218,9 +219,9 @@ def test_a_view_of_which_nothing_would_be_judged_is_refused_by_name(tmp_path: Pa
     left = torch.zeros(view.camera.height, view.camera.width, dtype=torch.bool)
     left[:, : view.camera.width // 2] = True
     with pytest.raises(InputError, match=f"{view.name}: its mask leaves nothing of the right half"):
-        Evaluator(run, options).judged(view, left)
+        Evaluator(run, options).renders.evaluated_pixels(view, left)
     left[0, -1] = True
-    assert Evaluator(run, options).judged(view, left).sum() == 1
+    assert Evaluator(run, options).renders.evaluated_pixels(view, left).sum() == 1
 
 
 def test_counts_and_sizes(figures: dict[str, Any]) -> None:

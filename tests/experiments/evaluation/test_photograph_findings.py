@@ -16,7 +16,8 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.resize import to_uint8
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
+from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on
 from gsx.experiments.reports.report import write_report
@@ -205,7 +206,7 @@ def test_a_test_view_is_drawn_where_its_left_half_was_taken(run: Run) -> None:
         beside = picture.clone()
         beside[..., view.camera.width // 2 :] = 0.5
         found = [
-            Evaluator(run, replace(options, poses="aligned")).drawn_from(replace(view, source=Taken(shown)))
+            Evaluator(run, replace(options, poses="aligned")).renders.camera(replace(view, source=Taken(shown)))
             for shown in (picture, beside)
         ]
     finally:

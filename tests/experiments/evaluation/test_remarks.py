@@ -4,11 +4,14 @@ import logging
 from pathlib import Path
 
 import pytest
+from module_contexts import build_module
 from tiny import tiny_run
 
 from gsx.core.files import read_json
 from gsx.experiments.evaluation.remarks import gathered, remarks_of
 from gsx.experiments.runs.progress import read_curves
+from gsx.modules.exposure import Exposure, ExposureOptions
+from gsx.modules.poses import PoseOptions, Poses
 
 LINES = [
     {"step": 10},
@@ -34,25 +37,33 @@ def test_a_whole_run_is_summed_up_by_hand() -> None:
         "warned": {"agreement": {"1": 0.0, "2": 0.25}},
     }
     assert found["pseudo"]["boot"] == {"asked": {"1": 8}, "dropped": {"1": 0.0}, "warned": {}}
-    exposures = {"step": 25, "spread": 0.1854, "learnt": 40, "motions": [0.04], "seconds": 1.75}
-    assert found["exposures"] == exposures
-    assert found["poses"] == {"step": 9, "spread": 0.72, "corrected": 40, "motions": [0.61, 0.2], "seconds": 2.5}
-    assert gathered(LINES[:1]) == {}
+    exposure, poses = build_module(Exposure, ExposureOptions()), build_module(Poses, PoseOptions())
+    figures = {"step": 25, "spread": 0.1854, "learnt": 40, "motions": [0.04], "seconds": 1.75}
+    assert exposure.summary(LINES) == {"exposures": figures}
+    figures = {"step": 9, "spread": 0.72, "corrected": 40, "motions": [0.61, 0.2], "seconds": 2.5}
+    assert poses.summary(LINES) == {"poses": figures}
+    assert gathered(LINES[:1]) == exposure.summary(LINES[:1]) == poses.summary(LINES[:1]) == {}
 
 
 def test_in_words() -> None:
-    assert remarks_of(gathered(LINES) | {"left_out": 2.5}) == [
+    assert remarks_of(gathered(LINES) | {"left_out": 2.5, "remarks": ["saved when it was evaluated"]}) == [
         "growth is held at backbone.max_primitives from step 20 on: the model may be too small",
         "up lost 25.0% of its x2 pictures",
         "25.0% of up's x2 pictures disagree with their input",
         "renders leave out 2.5 splats a view, whose values cannot be drawn",
-        "exposures of photographs are spread by 18.5%, each has its own from step 25 on: the model has that of the "
-        "mean photograph; eval.colours=fitted looks past that",
-        "training photographs lay 0.72 px beside the model, their poses are corrected from step 9 on: those of test "
-        "views are the scene's; eval.poses=aligned looks past that",
+        "saved when it was evaluated",
     ]
-    assert remarks_of({"poses": {"step": 9, "spread": 0.1, "corrected": 0}}) == []
-    assert remarks_of({"exposures": {"step": 25, "spread": 0.001, "learnt": 0}}) == []
+    exposure, poses = build_module(Exposure, ExposureOptions()), build_module(Poses, PoseOptions())
+    assert list(exposure.remarks(exposure.summary(LINES))) == [
+        "exposures of photos are spread by 18.5%, each has its own from step 25 on: the model has that of the mean "
+        "photo; eval.colours=fitted looks past that"
+    ]
+    assert list(poses.remarks(poses.summary(LINES))) == [
+        "poses of training photos were off by 0.72 px, they are corrected from step 9 on: those of test views are the "
+        "scene's; eval.poses=aligned looks past that"
+    ]
+    assert list(poses.remarks({"poses": {"step": 9, "spread": 0.1, "corrected": 0}})) == []
+    assert list(exposure.remarks({"exposures": {"step": 25, "spread": 0.001, "learnt": 0}})) == []
     assert remarks_of({"psnr": 30.0, "left_out": 0.0}) == []
 
 

@@ -26,7 +26,8 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.evaluation import evaluator
-from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
+from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.reports import pictures
 from gsx.experiments.reports.pictures import (

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
-from gsx.experiments.evaluation.evaluator import EvalOptions
+from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.runs.compose import Compositions, compose, compose_raw
 from gsx.experiments.runs.saved_settings import read_config, write_config
 from gsx.experiments.runs.settings import Settings
@@ -142,8 +142,8 @@ def test_published_values_of_gs3d() -> None:
 @pytest.mark.parametrize("backbone", ["gs3d", "mip_splatting"])
 def test_the_preset_for_zooming_in_holds_for_both_forms_of_gaussians(backbone: str) -> None:
     plain, zoom = composed(f"backbone={backbone}"), composed(f"backbone={backbone}", "preset=zoom")
-    assert (plain.training.supersample, plain.backbone.options.rates.shortened) == (1, 0.0)
-    assert (zoom.training.supersample, zoom.training.supersample_from) == (2, 0.8)
+    assert (plain.training.supersampling.factor, plain.backbone.options.rates.shortened) == (1, 0.0)
+    assert (zoom.training.supersampling.factor, zoom.training.supersampling.start) == (2, 0.8)
     assert (zoom.backbone.options.filter, zoom.backbone.options.rates.shortened) == ("mip", 0.4)
     published = composed(f"backbone={backbone}", "preset=zoom", "iterations=30000").backbone.options
     assert published.rates == replace(plain.backbone.options.rates, shortened=0.4)  # the same where nothing is shorter
@@ -154,7 +154,7 @@ def test_plain_gsx_trains_for_zooming_in_and_3d_gs_is_one_word_away() -> None:
     assert default.backbone.component.name == "gs3d_zoom"
     assert replace(default.backbone.options, name="gs3d") == spelt.backbone.options
     assert default.training == spelt.training
-    assert (plain.backbone.options.filter, plain.training.supersample) == ("none", 1)
+    assert (plain.backbone.options.filter, plain.training.supersampling.factor) == ("none", 1)
     assert plain.backbone.options.rates.shortened == 0
 
 
@@ -232,7 +232,7 @@ def test_common_scene_defaults_agree_with_the_schema() -> None:
         (["seed=-1"], "seed is -1; give a number from 0"),
         (["seed=9223372036854775808"], "seed"),
         (["warm_start_at=[0]"], "warm_start_at is \\[0\\]; give a number from 1"),
-        (["training.supersample_from=1"], "training.supersample_from is 1.0; give a share of the steps"),
+        (["training.supersampling.start=1"], "training.supersampling.start is 1.0; give a share of the steps"),
         (["backbone=scaffold", "preset=zoom"], "'backbone.rates.shortened' is no configuration key"),
         (["rasterizer.dilation=0"], "rasterizer.dilation is 0"),
         (["output=${oc.env:GSX_UNSET_VARIABLE}/x"], "cannot be resolved"),

@@ -17,8 +17,8 @@ CONF = Path(__file__).parents[3] / "conf"
 
 
 def test_a_value_with_its_range_and_every_file_that_sets_it() -> None:
-    lines = explain("training.supersample", [], plugins())
-    assert lines[:2] == ["training.supersample = 2", "  whole number from 1 to 16"]
+    lines = explain("training.supersampling.factor", [], plugins())
+    assert lines[:2] == ["training.supersampling.factor = 2", "  whole number from 1 to 16"]
     places = [re.fullmatch(r"  conf/(\S+):(\d+)  (\S+)", line) for line in lines]
     told = {found[1]: (int(found[2]), found[3]) for found in places if found}
     assert list(told) == ["preset/zoom.yaml", "config.yaml"]

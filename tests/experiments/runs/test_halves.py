@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from module_contexts import build_module
 from small_scene import published_options, small_scene, spread
 from tiny import tiny_run
 from torch import Tensor
@@ -26,6 +27,7 @@ from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.halves import held_out_renders, without
 from gsx.experiments.runs.open import open_run
+from gsx.modules.blur import Blur, BlurOptions
 
 TRAINING = TrainingOptions(
     ssim_weight=0.2, random_background=False, log_every=1, checkpoint_every=9, checkpoints_kept=1, test_points=0
@@ -65,7 +67,8 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
             ),
         )
 
-    generator, resolution = torch.Generator().manual_seed(0), TrainingViews(scene=scene)
+    generator = torch.Generator().manual_seed(0)
+    resolution = TrainingViews(scene=scene, modules={"blur": build_module(Blur, BlurOptions(), scene=scene)})
     run = Run(
         config={},
         folder=folder,
@@ -100,7 +103,7 @@ def test_views_are_rendered_by_a_model_that_never_saw_them(tmp_path: Path) -> No
 def test_a_half_sees_its_views_in_one_way(tmp_path: Path) -> None:
     """What its backbone judges by knows the movements that its loss does."""
     run, *_ = begun(tmp_path, steps=0)
-    run.blur.movements = {"view1": (0.1, 0.0)}
+    run.modules["blur"].movements = {"view1": (0.1, 0.0)}
     asked = list[TrainingViews]()
 
     def anew(scene: Scene, iterations: int, generator: torch.Generator, resolution: TrainingViews) -> Backbone:
@@ -109,7 +112,7 @@ def test_a_half_sees_its_views_in_one_way(tmp_path: Path) -> None:
 
     half = without(run, anew, 0, 10, 3)
     assert asked == [half.views]
-    assert half.blur.movements == run.blur.movements
+    assert half.modules["blur"].movements == run.modules["blur"].movements
 
 
 def state_of(run: Run) -> list[Tensor]:

@@ -17,11 +17,6 @@ from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, refuse_lfs_pointer, replace_file, write_json
 from gsx.core.training.parameter_table import restored_table, table_tensors
 from gsx.core.training.run import Run
-from gsx.modules.blur import Blur
-from gsx.modules.distractors import Distractors
-from gsx.modules.exposure import Exposures
-from gsx.modules.plateau import Plateau
-from gsx.modules.poses import Poses
 
 logger = logging.getLogger(__name__)
 
@@ -47,8 +42,8 @@ def write(run: Run, folder: Path) -> Path:
     from safetensors.torch import save as to_bytes
 
     held = table_tensors(run.backbone.table)
-    for prefix, part in parts_of(run).items():
-        held |= {prefix + name: value for name, value in part.tensors().items()}
+    for prefix, module in run.modules.items():
+        held |= {f"{prefix}.{name}": value for name, value in module.state_dict().items()}
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in held.items()}
     tensors[GENERATOR] = run.generator.get_state()
     data = to_bytes(tensors)
@@ -66,17 +61,6 @@ def write(run: Run, folder: Path) -> Path:
     }
     write_json(path.with_suffix(".json"), sidecar)
     return path
-
-
-def parts_of(run: Run) -> dict[str, Exposures | Blur | Plateau | Poses | Distractors]:
-    """What a run learns beside its model, by how the names of its tensors begin."""
-    return {
-        "exposure.": run.exposures,
-        "blur.": run.blur,
-        "plateau.": run.plateau,
-        "poses.": run.poses,
-        "distractors.": run.distractors,
-    }
 
 
 def names_of(run: Run) -> dict[str, list[str]]:
@@ -205,8 +189,8 @@ def restore(run: Run, training: bool = False) -> None:
         run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
     except (KeyError, RuntimeError, TypeError) as error:
         raise CheckpointError(f"a checkpoint of {run.folder} has no random numbers to go on with ({error})") from error
-    for prefix, part in parts_of(run).items():
-        part.restore(taken_out(tensors, prefix))
+    for prefix, module in run.modules.items():
+        module.load_state_dict(taken_out(tensors, f"{prefix}."))
     run.backbone.table = restored_table(run.backbone.table, tensors)
     run.step, run.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])

@@ -14,7 +14,7 @@ from gsx.core.training.run import Run
 def render_for_training(run: Run, camera: Camera, step: int, colour: Float[Tensor, "3"]) -> tuple[Drawn, Rendering]:
     """Returns (what the backbone draws at a step, its render), over a background colour.
 
-    Screen statistics are of the raster that was drawn; the picture is reduced from it (`training.supersample`).
+    Screen statistics are of the raster that was drawn; the picture is reduced from it.
     """
     raster, absolute = run.views.raster_for(step)(camera), run.backbone.absolute_gradient
     drawn = run.backbone.draw(raster.drawn_for, step)

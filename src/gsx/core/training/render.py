@@ -46,7 +46,7 @@ def render(
     `depth`: with that, as finely as it was rendered; where something stands behind the scene (`Backdrop`), depth
     and alpha are those of the scene alone: what shines through a wall does not move it away.
     """
-    times = supersample or times_as_fine(camera, run.scene.train, run.views.supersample_at(run.model_step))
+    times = supersample or times_as_fine(camera, run.scene.train, run.views.raster_scale(run.model_step))
     raster = finer_raster(camera, run.scene.reduction, times)
     drawn = splats_for(run, raster.drawn_for) if splats is None else splats
     far = behind_scene(run.backbone, drawn.means) if depth else None

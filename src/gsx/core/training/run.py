@@ -17,16 +17,12 @@ from gsx.core.ranges import Interval, Range, Share
 from gsx.core.rasterizer import RasterSettings, Rendering
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.backbone import Backbone, Observation, Settling
+from gsx.core.training.backbone import Backbone, Observation
 from gsx.core.training.distributed import Ranks
+from gsx.core.training.module import Modules
 from gsx.core.training.photographs import Photographs
 from gsx.core.training.pseudo_views import Term
 from gsx.core.training.training_views import TrainingViews
-from gsx.modules.blur import Blur, BlurOptions
-from gsx.modules.distractors import DistractorOptions, Distractors
-from gsx.modules.exposure import ExposureOptions, Exposures
-from gsx.modules.plateau import Plateau, PlateauOptions
-from gsx.modules.poses import PoseOptions, Poses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,51 +37,14 @@ class TrainingOptions:
     test_points: Annotated[int, Range(0, 10**6)] = without_effect()
     batch: Annotated[int, Range(1, 10**6)] = 1
     """Views per step, whose mean loss it lowers. The default: runs older than this option."""
-    supersample: Annotated[int, Range(1, 16)] = 1
-    """Renders are so many times as fine as photographs, and are reduced as these were before they are compared
-    (`core.training.finer_raster`); whoever looks at the model does the same. 1: published."""
-    supersample_from: Share = 0.0
-    """Share of the steps that are rendered at the photographs' resolution before that."""
-
-    coarse: Annotated[int, Range(1, 64)] = 1
-    """Photographs are seen so many times as coarse at first: a power of two (`training.resolution`); published: 1."""
-    coarse_until: Share = 0.0
-    """Share of the steps after which they are seen as they are."""
-    exposure: ExposureOptions = field(default_factory=ExposureOptions)
-    poses: PoseOptions = field(default_factory=PoseOptions)
-    blur: BlurOptions = field(default_factory=BlurOptions)
-    distractors: DistractorOptions = field(default_factory=DistractorOptions)
     cooldown: Share = 0.0
     """Share of the steps, the last ones, over which all learning rates of the model go down to nothing, linearly; 0, as
     published: these stay as they are."""
-    plateau: PlateauOptions = field(default_factory=PlateauOptions)
-
-    def __post_init__(self) -> None:
-        if self.supersample_from == 1:
-            raise ValueError("training.supersample_from is 1.0; give a share of the steps below 1")
-        if self.coarse & (self.coarse - 1):
-            near = 1 << self.coarse.bit_length() - 1
-            raise ValueError(f"training.coarse is {self.coarse}; give a power of two, for example {near}")
 
     def pace(self, step: int, iterations: int) -> float:
         """What learning rates are multiplied by at a step."""
         steps = self.cooldown * iterations
         return min(1.0, max(0.0, (iterations - step + 1) / steps)) if steps >= 1 else 1.0
-
-    def resolution(self, scene: Scene, iterations: int, device: torch.device) -> TrainingViews:
-        """Of the training views in a run of so many steps on a device."""
-        names = [view.name for view in scene.train]
-        return TrainingViews(
-            scene=scene,
-            coarse=self.coarse,
-            coarse_until=round(self.coarse_until * iterations) if self.coarse > 1 else 0,
-            supersample=self.supersample,
-            finer_after=round(self.supersample_from * iterations) if self.supersample > 1 else 0,
-            poses=Poses(self.poses, [view.camera for view in scene.train], iterations),
-            distractors=Distractors(self.distractors, iterations),
-            exposures=Exposures(self.exposure, names, iterations, device),
-            blur=Blur(self.blur, iterations),
-        )
 
 
 @dataclass(eq=False)
@@ -182,32 +141,18 @@ class Run:
     photograph_bytes: int = 0
     """How many bytes photographs may take on the device (`core.training.photographs`)."""
     photographs: Photographs = field(init=False)
-    plateau: Plateau = field(init=False)
 
     def __post_init__(self) -> None:
         self.photographs = Photographs(self.device, self.photograph_bytes)
-        passing = -(-len(self.scene.train) // self.training.batch)
-        self.plateau = Plateau(self.training.plateau, self.iterations, passing, settled=settled_after(self))
 
     @property
-    def poses(self) -> Poses:
-        """Of the training photographs."""
-        return self.views.poses
+    def modules(self) -> Modules:
+        """Modules of the run by name, in the order of their registration."""
+        return self.views.modules
 
-    @property
-    def distractors(self) -> Distractors:
-        """Of the training photographs."""
-        return self.views.distractors
-
-    @property
-    def exposures(self) -> Exposures:
-        """Of the training photographs."""
-        return self.views.exposures
-
-    @property
-    def blur(self) -> Blur:
-        """Of the training photographs."""
-        return self.views.blur
+    def skipped(self, step: int) -> bool:
+        """Returns whether a module skipped a step."""
+        return any(step in module.skipped for module in self.modules.values())
 
     @property
     def train_views(self) -> Sequence[View]:
@@ -219,9 +164,9 @@ class Run:
         """All iterations are done."""
         return self.step >= self.iterations
 
-    def as_photographed(self, image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
-        """A render as the photograph of a training view shows it, to be looked at."""
-        return self.views.as_photographed(image, view)
+    def as_photo(self, image: Float[Tensor, "3 H W"], view: View) -> Float[Tensor, "3 H W"]:
+        """Returns a render of a training view as its photo would show it, to be looked at."""
+        return self.views.match_photo(image, None, view)
 
     def refuse_if_stopping(self) -> None:
         """To be called within long parts of a step that change nothing yet.
@@ -274,20 +219,3 @@ class StepResult:
         """PSNR of the training view before the update, dB; of a batch the mean over this rank's views."""
         own = psnr(self.rendering.image.detach().clamp(0, 1), self.target, self.counted)
         return (own + sum(other.psnr() for other in self.others)) / (1 + len(self.others))
-
-
-def settled_after(run: Run) -> int:
-    """Step after which nothing is due once before the last part of the run: of what photographs have wrong, of
-    the resolution that it renders at, of its backbone."""
-    own = run.backbone.settles() if isinstance(run.backbone, Settling) else ()
-    steps = [
-        *run.exposures.steps(),
-        *run.poses.steps(),
-        *run.blur.steps(),
-        *run.distractors.steps(),
-        run.views.coarse_until,
-        run.views.finer_after,
-        *own,
-    ]
-    last = run.training.plateau.last_part(run.iterations)
-    return max((step for step in steps if step < last), default=0)

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -20,7 +20,6 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.training.augmenter import accounts_of
 from gsx.core.training.backbone import Observation, Validating, remove_nonfinite
 from gsx.core.training.forward import observe, render_for_training
-from gsx.core.training.importance import Probe
 from gsx.core.training.minibatch import gradients_added, merge_gradients, rollback_on_error
 from gsx.core.training.parameter_table import zero_grad
 from gsx.core.training.pseudo_terms import backward_terms, request_terms, reusable_parts, reused_losses, without_windows
@@ -28,7 +27,6 @@ from gsx.core.training.pseudo_views import Term
 from gsx.core.training.run import Run, StepResult
 from gsx.engine.compile_cache import waiting_counted
 from gsx.engine.threads import relieve_oversubscription
-from gsx.modules.captures import judge_photographs
 
 logger = logging.getLogger(__name__)
 
@@ -52,12 +50,10 @@ def train(run: Run, plugins: Plugins) -> None:
 
 def train_step(run: Run, plugins: Plugins) -> StepResult:
     """One step in the order of the published loop (3D-GS, train.py): render, backward, statistics, density, Adam."""
-    judge_steps(run)
-    told = run.plateau.told_at(run.step + 1)
-    told |= judge_photographs(run)
+    metrics = before_step(run)
     with rollback_on_error(run):
         step = backward(run)
-        step.changes.update(told)
+        step.changes.update(metrics)
         reason = veto(run, step, plugins)
     run.changing = True
     if reason:
@@ -68,33 +64,18 @@ def train_step(run: Run, plugins: Plugins) -> StepResult:
         step.changes.update(run.backbone.densify_and_prune(step.number))
         run.backbone.table.pace = run.training.pace(step.number, run.iterations)
         run.backbone.update(step.number)
-        run.exposures.update(step.number)
+        for module in run.modules.values():
+            module.optimizer_step(step.number)
     run.step, run.changing = step.number, False
     return step if not reason else replace(step, skipped=reason)
 
 
-def judge_steps(run: Run) -> None:
-    """Find whether the last steps have gained what steps are to gain, where that is due; if not, all up to the last
-    part of the run are left out."""
-    plateau, done, views = run.plateau, run.step, run.views.at
-    judged = plateau.windows(views(done), plateau.begun) if plateau.judged_after(done) else None
-    begun = plateau.windows(views(done + 1), done) if plateau.begins_after(done) else None
-    after, before = errors_in(run, judged or {}, done), errors_in(run, begun or {}, done + 1)  # then nothing can fail
-    if judged:
-        plateau.judge(judged, after, done)
-        if plateau.left_out:
-            run.step = plateau.last - 1
-            return
-    if begun:
-        plateau.begin(done, before)
-
-
-def errors_in(run: Run, windows: Mapping[View, Window], step: int) -> Float[Tensor, "W"]:
-    """Squared error in each validation window by the rules of a step, the same on all ranks."""
-    if not windows:
-        return torch.zeros(0, dtype=torch.float64)
-    probe = Probe(model=run.backbone, views=run.views, step=run.model_step, raster_step=step)
-    return run.ranks.broadcast(lambda: probe.window_errors(windows).cpu())
+def before_step(run: Run) -> dict[str, float]:
+    """Let the modules estimate, correct or skip steps; returns their metrics."""
+    metrics: dict[str, float] = {}
+    for module in run.modules.values():
+        metrics |= module.before_step(run)
+    return metrics
 
 
 def veto(run: Run, step: StepResult, plugins: Plugins) -> str:
@@ -126,7 +107,8 @@ def backward(run: Run) -> StepResult:
     terms = request_terms(run, number, picked)
     colours = run.ranks.share([background(run) for _ in batch])  # drawn for all: generators stay alike
     views, steps = run.views.at(number), []
-    run.exposures.forget()
+    for module in run.modules.values():
+        module.zero_grad()
     run.photographs.see(views)
     for view, of_view, colour in zip(picked, terms, colours, strict=True):
         run.refuse_if_stopping()
@@ -183,8 +165,8 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
 def withheld_windows(run: Run, view: View, number: int) -> list[Window]:
     """Windows of a view that are kept to judge by at a step: the backbone's own, and those that judge the steps."""
     withheld = [run.backbone.validation_window(view, number)] if isinstance(run.backbone, Validating) else []
-    withheld.append(run.plateau.window(run.views.at(number), view, number))
-    return [window for window in withheld if window is not None]
+    ignored = [window for module in run.modules.values() for window in module.ignored_windows(run, view, number)]
+    return [window for window in withheld if window is not None] + ignored
 
 
 def counted_in_loss(view: View, windows: Sequence[Window]) -> Bool[Tensor, "H W"] | None:

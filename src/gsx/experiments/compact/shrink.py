@@ -9,7 +9,7 @@ whole model after the same.
 
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from statistics import fmean
@@ -31,13 +31,12 @@ from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.guard import Guard
 from gsx.core.training.importance import ROUNDING, Probe, draws_per_view
+from gsx.core.training.module import Modules
 from gsx.core.training.parameter_table import edit, restored_table, size_of, table_tensors
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.trainer import train_step
 from gsx.experiments.compact.reduction import Reduction
-from gsx.modules.distractors import Distractors
-from gsx.modules.poses import Poses
 
 logger = logging.getLogger(__name__)
 
@@ -116,7 +115,7 @@ def above_rounding(decibels: float) -> float:
 def shown(run: Run, view: View, gaussians: Gaussians | None) -> Float[Tensor, "3 H W"]:
     """A view by the model, or by other Gaussians, at the exposure of its photograph."""
     splats = None if gaussians is None else splats_of(gaussians, view.camera.centre)
-    return run.as_photographed(render(run, view.camera, splats=splats).image, view).clamp(0, 1).cpu()
+    return run.as_photo(render(run, view.camera, splats=splats).image, view).clamp(0, 1).cpu()
 
 
 # -- what is worth least -----------------------------------------------------------------------------------------------
@@ -190,7 +189,8 @@ class Shrinking:
             way: Reduction(run.backbone.table, self.worth, seen if way else None) for way in (True, False)
         }
         """The order of rows by whether they may be merged."""
-        self.whole, self.exposures = copied(table_tensors(run.backbone.table)), copied(run.exposures.tensors())
+        self.whole = copied(table_tensors(run.backbone.table))
+        self.modules = {name: copied(module.state_dict()) for name, module in run.modules.items()}
         learn_on(run, self.learnt, degree_of_run(run), options.steps, plugins)
         self.reference = figures(run, self.judging, options.zooms)
         """Of the whole model, which has learnt on like every try: views that judge are no longer learnt from."""
@@ -246,7 +246,8 @@ class Shrinking:
         colours of a degree."""
         backbone = self.run.backbone
         backbone.table = restored_table(backbone.table, copied(self.whole))
-        self.run.exposures.restore(self.exposures)
+        for name, module in self.run.modules.items():
+            module.load_state_dict(self.modules[name])
         if 0 <= degree < len(self.colours):
             every = torch.ones_like(self.worth, dtype=torch.bool)
             take_coefficients(backbone.table, every, self.colours[degree])
@@ -318,7 +319,7 @@ class Shrinking:
             learn_on(run, run.train_views, best.degree, self.options.steps, self.plugins)
 
 
-def copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def copied(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Tensors of their own."""
     return {name: value.detach().clone() for name, value in tensors.items()}
 
@@ -348,17 +349,24 @@ def learn_on(run: Run, views: Sequence[View], degree: int, steps: int, plugins: 
 @contextmanager
 def extended(run: Run, views: Sequence[View], steps: int) -> Iterator[None]:
     """The run as one that ends so many steps later, with these training views; afterwards nothing has been counted."""
-    names = ("step", "iterations", "seconds", "scene", "sampler", "training", "resolution")
+    names = ("step", "iterations", "seconds", "scene", "sampler", "training", "views")
     before = {name: getattr(run, name) for name in names}
     run.scene, run.sampler = replace(run.scene, train=list(views)), Sampler(len(views), 0, batch=run.training.batch)
     run.iterations = run.step + steps
-    run.views = replace(run.views, scene=run.scene, coarse_views={}, poses=Poses(), distractors=Distractors())
+    run.views = replace(run.views, scene=run.scene, modules=modules_for(run, views))
     run.training = replace(run.training, cooldown=steps / run.iterations)
     try:
         yield
     finally:
         for name, value in before.items():
             setattr(run, name, value)
+
+
+def modules_for(run: Run, views: Sequence[View]) -> Modules:
+    """Returns the run's modules for some of its views as they are corrected now: poses and masks are theirs already."""
+    context = replace(run.modules["poses"].context, scene=replace(run.scene, train=list(views)))
+    corrected = {name: run.modules[name].restarted(replace(context, name=name)) for name in ("poses", "distractors")}
+    return {**run.modules, **corrected}
 
 
 @torch.no_grad()

@@ -4,82 +4,32 @@ Beside each zoomed figure stands the naive competitor, the x1 render resized by 
 that loses to it adds artefacts, not detail.
 """
 
-import hashlib
-import json
-import math
 import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera
 from gsx.core.data.masks import blacked
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
-from gsx.core.errors import InputError
-from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
-from gsx.core.ranges import Range
-from gsx.core.rasterizer import TiledRendering
+from gsx.core.quality.metrics import bicubic, psnr, quantise, ssim
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.parameter_table import size_of
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.engine.compiled import path_of
 from gsx.experiments.evaluation.detail import Details, details_of, explained
-from gsx.experiments.evaluation.lpips import LpipsOptions, load_lpips
-from gsx.experiments.evaluation.remarks import NOT_MEASURED, gathered
+from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.evaluated_renders import EvaluatedRenders
+from gsx.experiments.evaluation.lpips import load_lpips
+from gsx.experiments.evaluation.protocol import protocol_of
+from gsx.experiments.evaluation.remarks import NOT_MEASURED, gathered, module_remarks, module_summaries
 from gsx.experiments.run_folder.files import DETAIL_OF
-from gsx.modules.alignment import aligned
-from gsx.modules.exposure import best_matrix, transformed
-
-COLOURS, POSES = ("rendered", "fitted"), ("given", "aligned")
-ALIGNED = 2
-"""How often a pose is moved to where its photograph was taken, each time by a new render."""
-LEAST_TILE_PIXELS = 16 * 16
-"""One tile of the published rasterizer."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvalOptions:
-    """Options; values in conf/config.yaml. What changes figures is saved and hashed with every result."""
-
-    zoom: Annotated[list[float], Range(1 / 64, 64)]
-    quantise: bool
-    ssim: str
-    tile_pixels: Annotated[int, Range(LEAST_TILE_PIXELS, 1 << 31)]
-    lpips: LpipsOptions
-    supersample: Annotated[int, Range(0, 16)] = 0
-    """Renders are so many times as fine as each picture and are reduced; 0: as the run was trained."""
-    colours: str = "rendered"
-    """rendered: as the model shows them; fitted: by one matrix of colours a view, which its left half is fitted by and
-    its right half judged."""
-    poses: str = "given"
-    """given: views are drawn where the scene says; aligned: where the model says that they were taken, told from their
-    left halves, and their right halves are judged."""
-    flight: bool = True
-    """Draw a flight into the finest detail, for the report."""
-    remedy: str = ""
-    """Overrides that are suggested where a render zoomed in loses to the enlarged one; empty: none."""
-
-    def __post_init__(self) -> None:
-        if self.ssim not in SSIM_VARIANTS:
-            raise ValueError(f"eval.ssim is '{self.ssim}'; choose from {', '.join(SSIM_VARIANTS)}")
-        if self.colours not in COLOURS:
-            raise ValueError(f"eval.colours is '{self.colours}'; choose from {', '.join(COLOURS)}")
-        if self.poses not in POSES:
-            raise ValueError(f"eval.poses is '{self.poses}'; choose from {', '.join(POSES)}")
-        if not self.zoom:
-            raise ValueError("eval.zoom is empty; give factors, for example [1,2,4]")
-
-    @property
-    def right_halves(self) -> bool:
-        """Whether left halves tell something of views, and right halves alone are judged."""
-        return self.colours == "fitted" or self.poses == "aligned"
 
 
 def peak_memory_mb(device: torch.device) -> float | None:
@@ -92,31 +42,6 @@ def peak_memory_mb(device: torch.device) -> float | None:
         return None
     unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is in bytes on macOS, in KiB elsewhere
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
-
-
-def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, Any]:
-    """What two results must share to be compared, and its hash."""
-    protocol: dict[str, Any] = {
-        "scene": {key: value for key, value in run.scene.provenance.items() if key != "notes"},
-        "test_views": [view.name for view in run.scene.test],
-        "train_views": len(run.scene.train),
-        "size": list((*run.scene.test, *run.scene.train)[0].camera.size),
-        "background": run.scene.background.tolist(),
-        "quantised_to_8_bit": options.quantise,
-        "psnr": "mean over views of 20 log10(1/sqrt(MSE)), all pixels and channels",
-        "ssim": options.ssim,
-        "lpips": lpips_name,
-        "enlarged": "x1 render, antialiased Keys bicubic",
-    }
-    if "masks" in protocol["scene"]:
-        protocol |= {"masks": "PSNR and SSIM over the pixels that count, the others black in all pictures"}
-    if options.colours == "fitted":
-        protocol |= {"colours": "3x4 matrix a view, least squares on the left half; all figures of the right half"}
-    if options.poses == "aligned":
-        protocol |= {"poses": "aligned to the model by the left half; all figures of the right half"}
-    text = json.dumps(protocol, sort_keys=True, default=str)
-    # which zooms were looked at changes no figure, so it does not enter the hash
-    return protocol | {"zoom": list(options.zoom), "hash": hashlib.sha256(text.encode()).hexdigest()[:16]}
 
 
 def mean(values: Sequence[float | None]) -> float | None:
@@ -176,93 +101,34 @@ def silent(amount: float, part: str) -> None:
     """Tells nobody."""
 
 
-def half(view: View, counted: Bool[Tensor, "H W"] | None, right: bool) -> Bool[Tensor, "H W"]:
-    """Which pixels of one half of a view count, of those that do."""
-    middle = view.camera.width // 2
-    out = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool) if counted is None else counted.clone()
-    out[:, slice(middle) if right else slice(middle, None)] = False
-    return out
-
-
-def aligned_to(run: Run, view: View) -> Camera:
-    """Where the model says that a view was taken, told from its left half."""
-    left, camera = half(view, view.counted(), right=False), view.camera
-    for _ in range(ALIGNED):
-        shown = render(run, camera, supersample=1, depth=True)
-        assert shown.depth is not None
-        camera = aligned(camera, shown.image, shown.depth, shown.alpha, view.image(), left, given=view.camera)
-    return camera
-
-
 class Evaluator:
     """Measures one run by one protocol; each view is rendered once at each zoom."""
 
     def __init__(self, run: Run, options: EvalOptions) -> None:
         self.run, self.options = run, options
-        self.lpips = load_lpips(options.lpips)
+        self.lpips, self.renders = load_lpips(options.lpips), EvaluatedRenders(run, options)
         self.times: list[float] = []
         """Seconds of each render at the training resolution, without its way to the CPU."""
         self.kept: dict[View, Tensor] = {}
         """Those renders, as bytes where they are quantised."""
-        self.matrices: dict[str, Float[Tensor, "3 4"]] = {}
-        """Of colours, by name of the view, where they are fitted."""
-        self.cameras: dict[str, Camera] = {}
-        """Where views were taken, by name, where poses are aligned."""
 
     def measured(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
         """The picture as metrics see it."""
         return quantise(image) if self.options.quantise else image
 
-    def fitted(self, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-        """A render of a view, at the training resolution first, in the colours that are judged."""
-        if self.options.colours == "rendered":
-            return image
-        if view.name not in self.matrices:
-            left = half(view, view.counted(), right=False)
-            self.matrices[view.name] = best_matrix(image, view.image().to(image.device), left)
-        return transformed(image, self.matrices[view.name]).clamp(0, 1)
-
-    def judged(self, view: View, counted: Bool[Tensor, "H W"] | None) -> Bool[Tensor, "H W"] | None:
-        """Which pixels of a view are judged, of those that count; None: all.
-
-        Raises:
-            InputError: none is.
-        """
-        if not self.options.right_halves:
-            return counted
-        right = half(view, counted, right=True)
-        if not right.any():
-            raise InputError(
-                f"{view.name}: its mask leaves nothing of the right half, by which pictures are judged where colours "
-                "are fitted or poses are aligned: give eval.colours=rendered eval.poses=given, or leave that view out"
-            )
-        return right
-
-    def drawn_from(self, view: View) -> Camera:
-        """The camera that a view is drawn from."""
-        if self.options.poses == "given":
-            return view.camera
-        if view.name not in self.cameras:
-            self.cameras[view.name] = aligned_to(self.run, view)
-        return view.camera.with_pose_of(self.cameras[view.name])
-
-    def rendered(self, view: View, factor: float = 1) -> TiledRendering:
-        """The model as the view's camera sees it, `factor` times as fine as a photograph. From afar a model of finer
-        renders is drawn as finely as it was trained."""
-        times = self.options.supersample
-        if factor < 1 and not times and self.run.views.supersample_at(self.run.model_step) > 1:
-            times = math.ceil(self.run.views.supersample_at(self.run.model_step) / factor)
-        return render(self.run, self.drawn_from(view), self.options.tile_pixels, times)
-
     def view(self, view: View) -> dict[str, Any]:
         """Figures of one view at the training resolution."""
-        self.drawn_from(view)  # what finds it is not part of the time of a render
+        self.renders.camera(view)  # estimating it is not part of the time of a render
         begun = time.perf_counter()
-        tiled = self.rendered(view)
+        tiled = self.renders.render(view)
         self.times.append(time.perf_counter() - begun - tiled.gathering)
-        whole, counted = self.measured(self.fitted(view, tiled.image)), view.counted()
+        whole, counted = self.measured(self.renders.fit(view, tiled.image)), view.counted()
         self.kept[view] = to_uint8(whole) if self.options.quantise else whole
-        image, truth, judged = blacked(whole, counted), blacked(view.image(), counted), self.judged(view, counted)
+        image, truth, judged = (
+            blacked(whole, counted),
+            blacked(view.image(), counted),
+            self.renders.evaluated_pixels(view, counted),
+        )
         return {
             "name": view.name,
             "group": view.group,
@@ -293,7 +159,7 @@ class Evaluator:
         finer = view.zoom(factor)
         if finer is None:
             return None
-        whole, image = self.whole(view), self.fitted(view, self.rendered(finer, factor).image)
+        whole, image = self.whole(view), self.renders.fit(view, self.renders.render(finer, factor).image)
         counted = finer.counted()
         enlarged, photograph = (bicubic(picture, *finer.camera.size) for picture in (whole, view.image()))
         return Zoomed(
@@ -303,7 +169,7 @@ class Evaluator:
             render=blacked(self.measured(image), counted),
             enlarged=blacked(self.measured(enlarged), counted),
             photograph=blacked(self.measured(photograph), counted),
-            counted=self.judged(finer, counted),
+            counted=self.renders.evaluated_pixels(finer, counted),
         )
 
     def zoom_figures(self, zoomed: Zoomed) -> dict[str, float]:
@@ -368,7 +234,7 @@ class Evaluator:
         """
         if self.options.right_halves:
             for view in self.run.scene.test:
-                self.judged(view, view.counted())
+                self.renders.evaluated_pixels(view, view.counted())
         run, views = self.run, self.views(advance)
         primitives, size = size_of(run.backbone.table)
         groups = sorted({v["group"] for v in views if v["group"]})
@@ -376,7 +242,7 @@ class Evaluator:
         figures = ("psnr", "ssim", "lpips")
         if drawing is not None:
             drawing.choose(views)
-        return {
+        evaluation = {
             "protocol": protocol_of(run, self.options, self.lpips.name if self.lpips else "n/a (no weights)"),
             "step": run.step,
             **{key: mean([v[key] for v in views]) for key in figures},
@@ -384,6 +250,7 @@ class Evaluator:
             "visible_primitives": mean([v["visible"] for v in views]),
             "left_out": mean([v["left_out"] for v in views]),
             **gathered(run.curves),
+            **module_summaries(run),
             "megabytes": size / 1e6,
             "render_fps": self.frames_per_second(),
             "render_path": path_of(run.raster, run.device),
@@ -393,6 +260,7 @@ class Evaluator:
             "zoom": self.zooms(views, drawing, advance),
             "views": [{key: v[key] for key in ("name", "group", *figures)} for v in views],
         }
+        return evaluation | module_remarks(run, evaluation)
 
 
 def zoom_entry(factor: float, figures: Sequence[dict[str, float]], details: Sequence[Details]) -> dict[str, Any]:

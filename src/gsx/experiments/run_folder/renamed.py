@@ -14,7 +14,7 @@ MOVED = {
     "training.supersample_from": "training.supersampling.start",
 }
 """New dotted keys by the old ones, of which digests of compositions are still made (`run_key`)."""
-RENAMED = {
+RENAMED = MOVED | {
     "trunk_at": "warm_start_at",
     "backbone.rates.sh_constant": "backbone.rates.sh_dc",
     "backbone.clone_split.rates.sh_constant": "backbone.clone_split.rates.sh_dc",

@@ -18,9 +18,10 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
 from gsx.core.training.distributed import Ranks, ranks_here
+from gsx.core.training.module import ModuleContext, Modules
 from gsx.core.training.photographs import room_for_photographs
 from gsx.core.training.regenerator import Regenerator
-from gsx.core.training.run import Run, Sampler, TrainingOptions
+from gsx.core.training.run import Run, Sampler
 from gsx.core.training.training_views import TrainingViews
 from gsx.engine.allocator import keep_freed_memory
 from gsx.engine.cache import MANIFEST, cache_folder, content_key, make_folder
@@ -71,15 +72,25 @@ def refuse_uneven(batch: int, ranks: Ranks) -> None:
         )
 
 
-def refuse_shared(training: TrainingOptions, ranks: Ranks) -> None:
-    """Raise ConfigError where processes would have to find together what photographs have wrong."""
-    for key in ("exposure", "poses", "blur", "distractors"):
-        when = getattr(training, key).when
-        if ranks.size > 1 and when != "never":
+def refuse_shared(modules: Modules, ranks: Ranks) -> None:
+    """Raise ConfigError for a module that does not work with so many processes."""
+    for name, module in modules.items():
+        if not module.supports(ranks.size):
             raise ConfigError(
-                f"training.{key}.when is '{when}', which is for one process, and {ranks.size} train together: set it "
-                "to never, or start gsx without torchrun"
+                f"training.{name} works in one process, and {ranks.size} train together: switch it off "
+                f"(training.{name}.when=never), or start gsx without torchrun"
             )
+
+
+def build_modules(settings: Settings, scene: Scene, device: torch.device) -> Modules:
+    """Returns the training modules of a run, in the order of their registration."""
+    facts: dict[str, Any] = {"scene": scene, "device": device, "batch": settings.training.batch}
+    return {
+        name: chosen.component.factory(
+            chosen.options, ModuleContext(name=name, iterations=settings.general.iterations, **facts)
+        )
+        for name, chosen in settings.modules.items()
+    }
 
 
 ALONE = Ranks()
@@ -152,21 +163,22 @@ def build(
     device = placed(choose_device(general.device))
     if training:
         refuse_uneven(settings.training.batch, ranks)
-        refuse_shared(settings.training, ranks)
     prepare_process(device, training)
     torch.manual_seed(general.seed)
     generator = torch.Generator().manual_seed(general.seed)
     raster = decide(settings.raster, general.iterations, device) if training else settings.raster
-    own = settings.training.resolution(scene, general.iterations, device)
+    views = TrainingViews(scene=scene, modules=build_modules(settings, scene, device))
+    if training:
+        refuse_shared(views.modules, ranks)
 
     anew = partial(backbone_of, settings.backbone, device, raster)
     if splat_file(general.init):
         stand_in = in_front_of(scene.train[0].camera)
         one = replace(scene, points=one_point(stand_in))
-        backbone = anew(one, general.iterations, generator, own, ranks, begins=False)
+        backbone = anew(one, general.iterations, generator, views, ranks, begins=False)
         go_on_from(backbone, start or stand_in, settings.backbone.component.name)
     else:
-        backbone = anew(scene, general.iterations, generator, own, ranks, begins)
+        backbone = anew(scene, general.iterations, generator, views, ranks, begins)
     return Run(
         config=settings.resolved,
         folder=folder,
@@ -174,7 +186,7 @@ def build(
         backbone=backbone,
         raster=backbone.raster,
         training=settings.training,
-        views=own,
+        views=views,
         iterations=general.iterations,
         device=device,
         generator=generator,
@@ -253,4 +265,6 @@ def plan_of(run: Run) -> dict[str, Any]:
     own = run.backbone.plan() if isinstance(run.backbone, Planned) else {}
     if not all(isinstance(part, Mapping) for part in own.values()):
         own = {run.config["backbone"]["name"]: own}
-    return own | run.plateau.plan() | {name: augmenter.plan() for name, augmenter in run.augmenters.items()}
+    for module in run.modules.values():
+        own |= module.plan(run)
+    return own | {name: augmenter.plan() for name, augmenter in run.augmenters.items()}

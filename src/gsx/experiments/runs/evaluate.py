@@ -8,7 +8,8 @@ from gsx.core.errors import TooManyPairs, first_line
 from gsx.core.files import write_json
 from gsx.core.training.run import Run
 from gsx.engine.threads import relieve_oversubscription
-from gsx.experiments.evaluation.evaluator import EvalOptions, Evaluator
+from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.remarks import measures_nothing, remarks_of
 from gsx.experiments.reports.pictures import Pictures
 from gsx.experiments.run_folder.files import DETAIL_OF, detail_share, read_run

@@ -173,7 +173,7 @@ def zoomed_note(raster: RasterSettings) -> list[str]:
 
 def supersampling_note(run: Run) -> list[str]:
     """Returns through which finer pixels the model was trained, if any."""
-    times = run.views.supersample_at(run.model_step)
+    times = run.views.raster_scale(run.model_step)
     filter_ = run.scene.reduction.filter
     return [f"trained through renders {times} times as fine, reduced by the {filter_} filter"] if times > 1 else []
 

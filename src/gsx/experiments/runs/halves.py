@@ -27,9 +27,6 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.trainer import train_step
 from gsx.core.training.training_views import TrainingViews
-from gsx.modules.blur import BlurOptions
-from gsx.modules.distractors import DistractorOptions
-from gsx.modules.poses import PoseOptions
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +64,7 @@ def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h
     for half in range(HALVES):
         model = trained(without(run, anew, half, steps, seed), run.refuse_if_stopping)
         numbers = range(half, len(views), HALVES)
-        shown |= {n: to_uint8(run.blur.applied(render(model, views[n].camera).image, views[n])) for n in numbers}
+        shown |= {n: to_uint8(run.as_photo(render(model, views[n].camera).image, views[n])) for n in numbers}
     logger.info("each has rendered the views that it does not know, %.0f s", time.perf_counter() - begun)
     return [shown[number] for number in range(len(views))]
 
@@ -75,21 +72,21 @@ def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h
 def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
     """A run like this one at its step 0, of so many steps, on the views of the other half alone."""
     views = [view for number, view in enumerate(run.train_views) if number % HALVES != half]
-    unasked = replace(run.training, poses=PoseOptions(), distractors=DistractorOptions(), blur=BlurOptions())
     scene = replace(run.scene, train=views, test=[])
     own = derived_seed("halves", seed, run.step, half)
     generator = torch.Generator().manual_seed(own)
-    resolution = unasked.resolution(scene, steps, run.device)
-    resolution.blur.movements = dict(run.blur.movements)
-    backbone = anew(scene, steps, generator, resolution)
+    contexts = {name: replace(module.context, scene=scene, iterations=steps) for name, module in run.modules.items()}
+    modules = {name: module.restarted(contexts[name]) for name, module in run.modules.items()}
+    training_views = TrainingViews(scene=scene, modules=modules)
+    backbone = anew(scene, steps, generator, training_views)
     return Run(
         config=run.config,
         folder=run.folder,
         scene=scene,
         backbone=backbone,
         raster=backbone.raster,
-        training=unasked,
-        views=resolution,
+        training=run.training,
+        views=training_views,
         iterations=steps,
         device=run.device,
         generator=generator,

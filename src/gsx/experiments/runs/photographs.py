@@ -17,6 +17,7 @@ from gsx.core.plugins import Plugins
 from gsx.core.quality.metrics import psnr
 from gsx.core.quality.sharpness import sharpness
 from gsx.core.shapes import Float
+from gsx.core.training.module import TrainingModule
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.engine.threads import relieve_oversubscription
@@ -27,6 +28,7 @@ from gsx.experiments.run_folder.claims import claimed
 from gsx.experiments.runs.open import as_trained, open_run, refuse_other, refuse_training
 from gsx.experiments.runs.progress import Countdown
 from gsx.experiments.runs.rasterizer_path import warm
+from gsx.modules.corrections import Correction
 from gsx.modules.shifts import shift_of
 
 FOLDER = "photographs"
@@ -64,9 +66,17 @@ def findings_of(run: Run, pixels: int) -> list[Finding]:
     for view in views:
         found.append(finding(run, view, known.get(view.name), pixels))
         progress.advance(1, view.name)
-    learnt, corrected = run.exposures.matrices is not None, run.poses.matrices is not None
-    told = remarks_on(found, run.training.exposure.when, learnt, corrected)
-    return sorted((replace(one, remarks=said) for one, said in zip(found, told, strict=True)), key=lambda one: one.psnr)
+    exposure, poses = run.modules.get("exposure"), run.modules.get("poses")
+    when = "never" if exposure is None else exposure.options.when
+    remarks = remarks_on(found, when, is_active(exposure), is_active(poses))
+    return sorted(
+        (replace(one, remarks=said) for one, said in zip(found, remarks, strict=True)), key=lambda one: one.psnr
+    )
+
+
+def is_active(module: TrainingModule | None) -> bool:
+    """Returns whether a module corrects photos now."""
+    return isinstance(module, Correction) and module.active
 
 
 def different(views: Sequence[View]) -> list[View]:
@@ -100,7 +110,7 @@ def finding(run: Run, view: View, known_sharpness: float | None, pixels: int) ->
 
 def at_exposure(run: Run, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
     """Returns a render at the exposure and with the movement of its photograph, on the CPU."""
-    return run.as_photographed(image, view).clamp(0, 1).cpu()
+    return run.as_photo(image, view).clamp(0, 1).cpu()
 
 
 @torch.no_grad()

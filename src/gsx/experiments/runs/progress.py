@@ -11,7 +11,8 @@ from typing import IO, Any
 from gsx.core.files import replace_file
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run, StepResult
-from gsx.experiments.evaluation.evaluator import EvalOptions, peak_memory_mb, quick_psnr
+from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.evaluator import peak_memory_mb, quick_psnr
 from gsx.experiments.run_folder.files import read_lines
 
 METRICS = "metrics.jsonl"

@@ -10,7 +10,7 @@ from gsx.core.files import write_json
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.experiments.evaluation.evaluator import EvalOptions
+from gsx.experiments.evaluation.eval_options import EvalOptions
 
 logger = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from gsx.core.ranges import Range, Share
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.regenerator import NamesCode
 from gsx.core.training.run import TrainingOptions
-from gsx.experiments.evaluation.evaluator import EvalOptions
+from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
 from gsx.experiments.runs.typed import right_key, schema_keys, texts, typed
 from gsx.formats.suffixes import splat_file_at, suffix_of

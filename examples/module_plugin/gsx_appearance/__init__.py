@@ -1,0 +1,55 @@
+"""A training module of a third party: one appearance code per photo, decoded to a colour matrix (after NeRF-W)."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.plugins import Registry, hookimpl
+from gsx.core.quality.colour_matrix import transform_colours
+from gsx.core.training.learned_module import LearnedModule
+from gsx.core.training.module import ModuleContext
+
+
+@dataclass(frozen=True, kw_only=True)
+class AppearanceOptions:
+    size: int = 4
+    """Numbers in a code."""
+    rate: float = 0.005
+    """Learning rate of Adam."""
+
+
+class Appearance(LearnedModule):
+    def __init__(self, options: AppearanceOptions, context: ModuleContext) -> None:
+        photos, generator = [view.name for view in context.scene.train], torch.Generator().manual_seed(0)
+        self.index = {name: number for number, name in enumerate(photos)}
+        codes, decoder = torch.zeros(len(photos), options.size), torch.randn(12, options.size, generator=generator)
+        super().__init__(options, context, options.rate, codes=codes, decoder=decoder)
+
+    def before_step(self, run: Any) -> dict[str, float]:
+        return {"appearance": float(self.learned["codes"].detach().std())}
+
+    def transform_render(self, image: Tensor, view: Any, photo: Any, window: Any, learning: bool) -> Tensor:
+        code = self.learned["decoder"] @ self.learned["codes"][self.index[view.name]]
+        matrix = torch.eye(3, 4, device=code.device) + code.view(3, 4)
+        return transform_colours(image.to(code.device), matrix if learning else matrix.detach())
+
+    def summary(self, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        spreads = [line["appearance"] for line in lines if "appearance" in line]
+        return {"appearance": {"spread": spreads[-1]}} if spreads else {}
+
+    def remarks(self, evaluation: Mapping[str, Any]) -> Iterator[str]:
+        if "appearance" in evaluation:
+            yield f"appearance codes of photos have a spread of {evaluation['appearance']['spread']:.3f}"
+
+
+@hookimpl
+def gsx_register(registry: Registry) -> None:
+    registry.add("module", "appearance", Appearance, AppearanceOptions)
+
+
+@hookimpl
+def gsx_config_paths() -> list[str]:
+    return ["pkg://gsx_appearance.conf"]

@@ -1,0 +1,93 @@
+"""Renders of held-out views as an evaluation compares them: aligned cameras, fitted colours, finer rasters."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.scene import View
+from gsx.core.errors import InputError
+from gsx.core.quality.colour_matrix import fit_colours, transform_colours
+from gsx.core.rasterizer import TiledRendering
+from gsx.core.shapes import Bool, Float
+from gsx.core.training.render import render
+from gsx.core.training.run import Run
+from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.modules.alignment import aligned
+
+ALIGNMENTS = 2
+"""Number of times that a pose moves to where its photo was taken, each time by a new render."""
+
+
+class EvaluatedRenders:
+    """Renders of a run's held-out views by the options of an evaluation."""
+
+    def __init__(self, run: Run, options: EvalOptions) -> None:
+        self.run, self.options = run, options
+        self.matrices: dict[str, Float[Tensor, "3 4"]] = {}
+        """Fitted colour matrices by name of a view."""
+        self.cameras: dict[str, Camera] = {}
+        """Aligned cameras by name of a view."""
+
+    def camera(self, view: View) -> Camera:
+        """Returns the camera that a view is rendered from."""
+        if self.options.poses == "given":
+            return view.camera
+        if view.name not in self.cameras:
+            self.cameras[view.name] = align_camera(self.run, view)
+        return view.camera.with_pose_of(self.cameras[view.name])
+
+    def render(self, view: View, factor: float = 1) -> TiledRendering:
+        """Renders the view, which is `factor` times as fine as a photo.
+
+        From afar a model that was trained on finer renders is rendered as finely as it was trained.
+        """
+        times, trained = self.options.supersample, self.run.views.raster_scale(self.run.model_step)
+        if factor < 1 and not times and trained > 1:
+            times = math.ceil(trained / factor)
+        return render(self.run, self.camera(view), self.options.tile_pixels, times)
+
+    def fit(self, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+        """Returns a render of a view in the colours that are compared; call it at the photos' resolution first."""
+        if self.options.colours == "rendered":
+            return image
+        if view.name not in self.matrices:
+            left = half(view, view.counted(), right=False)
+            self.matrices[view.name] = fit_colours(image, view.image().to(image.device), left)
+        return transform_colours(image, self.matrices[view.name]).clamp(0, 1)
+
+    def evaluated_pixels(self, view: View, counted: Bool[Tensor, "H W"] | None) -> Bool[Tensor, "H W"] | None:
+        """Returns the pixels of a view that are compared, of those that count; None: all.
+
+        Raises:
+            InputError: there are none.
+        """
+        if not self.options.right_halves:
+            return counted
+        right = half(view, counted, right=True)
+        if not right.any():
+            raise InputError(
+                f"{view.name}: its mask leaves nothing of the right half, by which pictures are compared where colours "
+                "are fitted or poses are aligned: give eval.colours=rendered eval.poses=given, or leave that view out"
+            )
+        return right
+
+
+def half(view: View, counted: Bool[Tensor, "H W"] | None, right: bool) -> Bool[Tensor, "H W"]:
+    """Returns the pixels of one half of a view, of those that count."""
+    middle = view.camera.width // 2
+    out = torch.ones(view.camera.height, view.camera.width, dtype=torch.bool) if counted is None else counted.clone()
+    out[:, slice(middle) if right else slice(middle, None)] = False
+    return out
+
+
+def align_camera(run: Run, view: View) -> Camera:
+    """Returns the camera where the model says that a view was taken, by its left half."""
+    left, camera = half(view, view.counted(), right=False), view.camera
+    for _ in range(ALIGNMENTS):
+        rendering = render(run, camera, supersample=1, depth=True)
+        assert rendering.depth is not None
+        pictures = rendering.image, rendering.depth, rendering.alpha, view.image()
+        camera = aligned(camera, *pictures, left, given=view.camera)
+    return camera

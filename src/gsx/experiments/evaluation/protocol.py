@@ -1,0 +1,33 @@
+"""The protocol of an evaluation: what two results must share to be compared."""
+
+import hashlib
+import json
+from typing import Any
+
+from gsx.core.training.run import Run
+from gsx.experiments.evaluation.eval_options import EvalOptions
+
+
+def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, Any]:
+    """Returns what two results must share to be compared, and its hash."""
+    protocol: dict[str, Any] = {
+        "scene": {key: value for key, value in run.scene.provenance.items() if key != "notes"},
+        "test_views": [view.name for view in run.scene.test],
+        "train_views": len(run.scene.train),
+        "size": list((*run.scene.test, *run.scene.train)[0].camera.size),
+        "background": run.scene.background.tolist(),
+        "quantised_to_8_bit": options.quantise,
+        "psnr": "mean over views of 20 log10(1/sqrt(MSE)), all pixels and channels",
+        "ssim": options.ssim,
+        "lpips": lpips_name,
+        "enlarged": "x1 render, antialiased Keys bicubic",
+    }
+    if "masks" in protocol["scene"]:
+        protocol |= {"masks": "PSNR and SSIM over the pixels that count, the others black in all pictures"}
+    if options.colours == "fitted":
+        protocol |= {"colours": "3x4 matrix a view, least squares on the left half; all figures of the right half"}
+    if options.poses == "aligned":
+        protocol |= {"poses": "aligned to the model by the left half; all figures of the right half"}
+    text = json.dumps(protocol, sort_keys=True, default=str)
+    # which zooms were looked at changes no figure, so it does not enter the hash
+    return protocol | {"zoom": list(options.zoom), "hash": hashlib.sha256(text.encode()).hexdigest()[:16]}

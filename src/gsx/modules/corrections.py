@@ -1,0 +1,118 @@
+"""Corrections of photos: when they are estimated, and what their options have in common."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, ClassVar, TypeVar
+
+import torch
+
+from gsx.core.data.scene import View
+from gsx.core.ranges import Range, Share
+from gsx.core.seeds import derived_seed
+from gsx.core.training.module import TrainingModule
+
+if TYPE_CHECKING:
+    from gsx.core.training.run import Run
+
+Item = TypeVar("Item")
+WHEN = ("never", "auto", "always")
+"""auto: correct what is found to be wrong; always: correct without a test."""
+Times = Annotated[int, Range(1, 1000)]
+ViewCount = Annotated[int, Range(3, 10**6)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectionOptions:
+    """When a correction is estimated; values in conf/module."""
+
+    key: ClassVar[str] = ""
+    """Name below `training`, for messages."""
+    when: str = "never"
+    """One of WHEN."""
+    start: Share = 0.2
+    """Share of the steps before the first estimate."""
+    until: Share = 0.7
+    """Share of the steps before the last estimate."""
+    times: Times = 5
+    """Number of estimates, at shares that grow by the same factor."""
+
+    def __post_init__(self) -> None:
+        if self.when not in WHEN:
+            raise ValueError(f"training.{self.key}.when is '{self.when}'; choose from {', '.join(WHEN)}")
+        if not 0 < self.start < 1 or not self.start <= self.until < 1:
+            raise ValueError(
+                f"training.{self.key}.start is {self.start} and training.{self.key}.until {self.until}: give shares of "
+                "the steps between 0 and 1, the second one not smaller"
+            )
+
+    def steps(self, iterations: int) -> list[int]:
+        """Returns the steps before which the correction is estimated: most of them early, when a model changes most."""
+        if self.when == "never":
+            return []
+        last = max(1, self.times - 1)
+        shares = [self.start * (self.until / self.start) ** (index / last) for index in range(self.times)]
+        return sorted({max(1, round(share * iterations)) + 1 for share in shares})
+
+
+class Correction(TrainingModule):
+    """A correction of photos: tested before one step, estimated before a few more where it is needed."""
+
+    options: CorrectionOptions
+    seconds_key: ClassVar[str]
+    """Key of the time that an estimate takes, in metrics.jsonl."""
+    last_estimate = 0
+    """Step before which it was estimated last: a step that is taken again does not estimate again."""
+
+    @property
+    def active(self) -> bool:
+        """Whether photos are corrected now."""
+        raise NotImplementedError
+
+    def estimate(self, run: "Run", step: int) -> dict[str, float]:
+        """Test and estimate before a step; returns metrics for its line."""
+        raise NotImplementedError
+
+    def before_step(self, run: "Run") -> dict[str, float]:
+        """Estimate the correction if it is due before the next step."""
+        step = run.step + 1
+        if not self.due(step):
+            return {}
+        start = time.perf_counter()
+        metrics = self.estimate(run, step)
+        return metrics | {self.seconds_key: round(time.perf_counter() - start, 3)}
+
+    def due(self, step: int) -> bool:
+        """Returns whether it is estimated before a step: before the first of its steps, then only if it is active."""
+        steps = self.milestones()
+        return step in steps and step > self.last_estimate and (step == steps[0] or self.active)
+
+    def milestones(self) -> list[int]:
+        """Returns the steps before which it is estimated."""
+        return self.options.steps(self.context.iterations)
+
+    def supports(self, ranks: int) -> bool:
+        """Returns whether it is off or one process trains: ranks do not estimate together."""
+        return ranks == 1 or self.options.when == "never"
+
+
+@dataclass(eq=False)
+class ViewCache:
+    """Views made from lists of views: the same result for the same list, until the cache is replaced."""
+
+    made: list[tuple[Sequence[View], list[View]]] = field(default_factory=list)
+
+    def get(self, views: Sequence[View], make: Callable[[], list[View]]) -> list[View]:
+        """Returns what was made of this list, or makes it."""
+        for source, made in self.made:
+            if source is views:
+                return made
+        self.made.append((views, make()))
+        return self.made[-1][1]
+
+
+def sample(items: Sequence[Item], count: int, purpose: str) -> list[Item]:
+    """Returns at most so many of the items, in random order: the same in every run."""
+    generator = torch.Generator().manual_seed(derived_seed(purpose))
+    order = torch.randperm(len(items), generator=generator)[:count]
+    return [items[index] for index in order.tolist()]

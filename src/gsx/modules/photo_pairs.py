@@ -1,0 +1,77 @@
+"""Photos beside the model's renders, as corrections are estimated from them."""
+
+import math
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.coarser import coarser
+from gsx.core.data.scene import View
+from gsx.core.rasterizer import TiledRendering
+from gsx.core.shapes import Bool, Float
+from gsx.core.training.render import render
+from gsx.core.training.run import Run
+
+Pair: TypeAlias = tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"], Bool[Tensor, "H W"] | None]
+"""Render, photo, mask of the pixels that count (None: all)."""
+REDUCTION = 2
+"""Estimates use views so many times smaller than photos: they take a third of the time."""
+DARK, LIGHT = 0.05, 0.95
+"""Display values between which a ratio is a gain: below is noise, above values may be saturated."""
+MIN_PIXELS, MIN_VIEWS = 64, 3
+"""Fewest pixels of which a gain is computed, and fewest views of which a spread is."""
+
+
+def render_reduced(run: Run, view: View, depth: bool = True, min_pixels: int = 0) -> tuple[View, TiledRendering]:
+    """Returns a reduced view and its render; the view as it is where the reduced one had fewer pixels."""
+    run.refuse_if_stopping()
+    pixels = view.camera.width * view.camera.height / REDUCTION**2
+    small = coarser(view, run.scene.reduction, REDUCTION) if pixels >= min_pixels else view
+    return small, render(run, small.camera, supersample=1, depth=depth)
+
+
+def usable_pixels(
+    image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"], mask: Bool[Tensor, "H W"] | None
+) -> Bool[Tensor, "H W"]:
+    """Returns the pixels that count and are neither dark nor light, in render and photo."""
+    usable = ((image > DARK) & (image < LIGHT) & (photo > DARK) & (photo < LIGHT)).all(0)
+    return usable if mask is None else usable & mask.to(usable.device)
+
+
+def log_gains(
+    image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"], mask: Bool[Tensor, "H W"] | None = None
+) -> Float[Tensor, "3"]:
+    """Returns the median of log(photo / image) of each channel, over usable pixels; nan where they are too few."""
+    usable = usable_pixels(image, photo, mask)
+    if int(usable.sum()) < MIN_PIXELS:
+        return torch.full((3,), torch.nan)
+    return (photo[:, usable] / image[:, usable]).log().double().median(dim=1).values.float().cpu()
+
+
+def gains(
+    image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"], mask: Bool[Tensor, "H W"] | None
+) -> Float[Tensor, "3"]:
+    """Returns how many times as bright as its render a photo is, by channel; 1 where pixels are too few."""
+    return log_gains(image, photo, mask).nan_to_num(0.0).exp()
+
+
+def match_brightness(
+    image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"], mask: Bool[Tensor, "H W"] | None
+) -> Float[Tensor, "3 H W"]:
+    """Returns a render as bright in each channel as its photo, and as saturated."""
+    return (gains(image, photo, mask)[:, None, None] * image).clamp(0, 1)
+
+
+def shared_spread(left: Float[Tensor, "N C"], right: Float[Tensor, "N C"]) -> float:
+    """Returns the standard deviation over photos of what both halves of a photo measure, in the mean over channels.
+
+    It is the root of the covariance of the halves, which their noise does not enter; 0 where that is negative, or
+    fewer than MIN_VIEWS photos have both halves.
+    """
+    known = (left.isfinite() & right.isfinite()).all(1)
+    if int(known.sum()) < MIN_VIEWS:
+        return 0.0
+    centred = [half[known] - half[known].mean(0) for half in (left, right)]
+    covariance = (centred[0] * centred[1]).sum(0) / (int(known.sum()) - 1)
+    return math.sqrt(max(0.0, float(covariance.mean())))
