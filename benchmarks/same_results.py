@@ -86,6 +86,8 @@ RUNS: Mapping[str, tuple[str, ...]] = {
 }
 CLOCKS = ("time", "seconds", "fps", "per_second", "memory_mb")
 """How keys of figures end that two runs of the same source do not share: seconds, speed, memory."""
+WORDS = ("version", "hash", "remarks")
+"""Keys of what follows the source by design: digests of the built-in scene's code, and sentences."""
 
 
 def arguments(words: Sequence[str]) -> argparse.Namespace:
@@ -195,8 +197,8 @@ def without_clocks(value: Any) -> Any:
 
 
 def is_clock(key: str) -> bool:
-    """Whether a key names seconds, speed or memory."""
-    return key.endswith(CLOCKS)
+    """Returns whether a key names seconds, speed, memory, or what follows the source."""
+    return key.endswith(CLOCKS) or key in WORDS
 
 
 def differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
