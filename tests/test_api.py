@@ -200,7 +200,7 @@ def test_the_page_does_what_it_says(
 def test_options_that_would_change_nothing_are_refused(run: gsx.TrainedRun, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"is a run, .*: origin is for splat files"):
         gsx.load(run.folder, origin=(1.0, 2.0, 3.0))
-    with pytest.raises(InputError, match=r"axes and spz_version are of \.spz files"):
+    with pytest.raises(InputError, match=r"axes and version are of \.spz files"):
         run.export(tmp_path / "a.ply", axes="rdf")
     assert not list(tmp_path.iterdir())
 

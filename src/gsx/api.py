@@ -46,7 +46,7 @@ from gsx.experiments.tables.sweep import is_table
 from gsx.formats.axis_names import AUTO, SPECIFIED
 from gsx.formats.origin import NO_ORIGIN
 from gsx.formats.splat_files import SpzForm, read_around
-from gsx.formats.suffixes import SPZ_VERSIONS, splat_file_at, suffix_of
+from gsx.formats.suffixes import SPZ_VERSIONS, splat_file_at
 from gsx.scenes.origin import moved
 
 __all__ = ["SplatFile", "TrainedRun", "load", "show_messages", "train", "write_image"]
@@ -122,13 +122,9 @@ class TrainedRun:
         it can. axes (rub, rdf) and spz_version (3, 4): of .spz.
 
         Raises:
-            InputError: the suffix is that of no format that is written, there is no such view, or no such form of .spz;
-                or a form of .spz is set for another format.
+            InputError: no such format is written, there is no such view or form of .spz, or the file is no .spz.
         """
-        refuse_export(path := Path(path))
-        spz = SpzForm(version=spz_version, axes=axes)
-        if spz != SpzForm() and suffix_of(path) != ".spz":
-            raise InputError(f"axes and spz_version are of .spz files, not of {path}: leave them out, or write .spz")
+        refuse_export(path := Path(path), spz := SpzForm(version=spz_version, axes=axes))
         export(self.run, path, None if seen is None else camera_in(self.run, seen), spz, local=local)
         return path
 

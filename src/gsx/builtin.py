@@ -34,11 +34,10 @@ def add_backbones(registry: Registry) -> None:
     from gsx.backbones.gs3d_options import GS3DOptions
     from gsx.backbones.octree_gs3d import OctreeGS3DOptions, octree_gs3d
 
-    registry.add("backbone", "gs3d", gs3d, GS3DOptions)
-    registry.add("backbone", "mip_splatting", gs3d, GS3DOptions)
-    registry.add("backbone", "gs3d_zoom", gs3d, GS3DOptions)
-    registry.add("backbone", "scaffold", neural_anchors, NeuralOptions)
-    registry.add("backbone", "octree_scaffold", neural_anchors, NeuralOptions)
+    for name in ("gs3d", "mip_splatting", "gs3d_zoom"):
+        registry.add("backbone", name, gs3d, GS3DOptions)
+    for name in ("scaffold", "octree_scaffold"):
+        registry.add("backbone", name, neural_anchors, NeuralOptions)
     registry.add("backbone", "octree_gs3d", octree_gs3d, OctreeGS3DOptions)
 
 

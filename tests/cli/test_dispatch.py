@@ -190,11 +190,13 @@ def test_text_of_any_command_that_cannot_be_written_is_one_sentence(
 
 
 def test_names_of_files_are_written_whatever_letters_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    with TextIOWrapper(written := BytesIO(), encoding="ascii", write_through=True) as ascii_only:
-        monkeypatch.setattr(sys, "stdout", ascii_only)
-        assert main(["--version"]) == 0
-        ascii_only.write("l\xe4ufe-\u65e5\udce4\n")  # the last is a byte that is no text
-        assert written.getvalue().endswith(b"l\\xe4ufe-\\u65e5\xe4\n")
+    cases = {"ascii": (b"l\\xe4ufe-\\u65e5\n", ""), "utf-8": ("l\xe4ufe-\u65e5".encode() + b"\xe4\n", "\udce4")}
+    for encoding, (expected, no_text) in cases.items():  # a byte that is no text
+        with TextIOWrapper(written := BytesIO(), encoding=encoding, write_through=True) as output:
+            monkeypatch.setattr(sys, "stdout", output)
+            assert main(["--version"]) == 0
+            output.write(f"l\xe4ufe-\u65e5{no_text}\n")
+            assert written.getvalue().endswith(expected)
 
 
 def test_a_reader_that_has_seen_enough_is_no_error() -> None:
@@ -486,7 +488,7 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
         "--to FOLDER is for pictures",
     ),
     "frames of no orbit": (lambda t: ["render", str(t / "run"), "--frames", "3"], "go with --orbit FILE"),
-    "axes of no spz": (lambda t: ["export", str(t / "run"), str(t / "x.ply"), "--axes", "rdf"], "is of .spz files"),
+    "axes of no spz": (lambda t: ["export", str(t / "run"), str(t / "x.ply"), "--axes", "rdf"], "are of .spz files"),
     "trade": (lambda t: ["trade", "training"], "whose page draws the fronts"),
     "a choice that is there twice": (
         lambda t: words(t / "run", "iterations=1", "augmenter=[upscale,bootstrap,upscale]"),

@@ -1,6 +1,5 @@
 """The command line: `gsx OVERRIDES...` trains; verbs do the rest. torch is imported only where it is needed."""
 
-import codecs
 import io
 import sys
 from collections.abc import Callable, Sequence
@@ -10,7 +9,7 @@ from gsx.cli.arguments import RESUME_FLAGS
 from gsx.cli.compact import verb_compact
 from gsx.cli.folder import is_given, train_from
 from gsx.cli.look import verb_datasets, verb_explain, verb_plugins, verb_report, verb_scenes
-from gsx.cli.messages import as_bytes, discard_unwritten, explained, unheard
+from gsx.cli.messages import discard_unwritten, explained, unheard
 from gsx.cli.runs import verb_eval, verb_export, verb_photographs, verb_render, verb_view
 from gsx.cli.train import verb_resume, verb_train
 from gsx.core.errors import ConfigError, nearest
@@ -55,12 +54,14 @@ TRADE_MOVED = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit code: 0 done, 2 something for the user to mend, 130 interrupted,
-    141 nobody reads on (`| head`)."""
+    """Runs the command line and returns the exit code.
+
+    0: done; 2: something for the user to correct; 130: interrupted; 141: nobody reads on (`| head`).
+    """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors in ("strict", "surrogateescape"):
-        codecs.register_error("names", as_bytes)
-        sys.stdout.reconfigure(errors="names")
+        unicode = sys.stdout.encoding.lower().startswith("utf")  # then only bytes of file names are no letters of it
+        sys.stdout.reconfigure(errors="surrogateescape" if unicode else "backslashreplace")
     if processes() > 1:
         from gsx.core.training.distributed import as_one
 
@@ -78,18 +79,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def dispatch_together(arguments: list[str]) -> int:
-    """Trains or resume on several processes.
+    """Trains or resumes on several processes.
 
     Raises:
         ConfigError: anything else is asked for.
     """
-    flags = {word for word in arguments if word.startswith("-")}
-    if flags - (set(RESUME_FLAGS) if arguments[:1] == ["resume"] else set()) or (
-        arguments[:1] and arguments[0] in VERBS and arguments[0] != "resume"
-    ):
-        asked = " ".join(arguments[:2])
-        raise ConfigError(f"gsx {asked}: torchrun is for training one scene and for gsx resume; call gsx without it")
     from gsx.experiments.tables.sweep import is_table
+
+    flags = {word for word in arguments if word.startswith("-")}
+    allowed = set(RESUME_FLAGS) if arguments[:1] == ["resume"] else set()
+    if flags - allowed or set(arguments[:1]) & (VERBS.keys() - {"resume"}):
+        words = " ".join(arguments[:2])
+        raise ConfigError(f"gsx {words}: torchrun is for training one scene and for gsx resume; call gsx without it")
 
     if is_table(arguments):
         raise ConfigError("a table is many runs, and torchrun is for one: call gsx without it (docs/clusters.md)")
@@ -97,7 +98,7 @@ def dispatch_together(arguments: list[str]) -> int:
 
 
 def dispatch(arguments: list[str]) -> int:
-    """Finds the verb and run it."""
+    """Finds the verb and runs it."""
     if arguments[:1] == ["help"] or ({"--help", "-h"} & set(arguments) and arguments[0] not in VERBS):
         sys.stdout.write(HELP)
         return 0

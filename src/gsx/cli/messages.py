@@ -12,19 +12,12 @@ from gsx.experiments.runs.job import INTERRUPTED
 
 def explained(error: BaseException) -> int:
     """Shows an error that people can correct and returns its exit code; raises others again."""
-    if isinstance(error, GsxError):
-        return complain(str(error))
-    if isinstance(error, OSError):
-        return complain(os_sentence(error))
     if isinstance(error, KeyboardInterrupt):
         say("\ngsx: interrupted; nothing half-written is left\n", as_error=True)
         return INTERRUPTED
-    raise error
-
-
-def complain(sentence: str) -> int:
-    """Shows an error as one sentence."""
-    say(f"gsx: {sentence}\n", as_error=True)
+    if not isinstance(error, GsxError | OSError):
+        raise error
+    say(f"gsx: {os_sentence(error) if isinstance(error, OSError) else error}\n", as_error=True)
     return 2
 
 
@@ -70,21 +63,3 @@ def os_sentence(error: OSError) -> str:
     remedy = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "check that path and its permissions"
     place = "a writable place: output=FOLDER to train, --to FOLDER where a command has that"
     return f"{error.strerror or error}{where}: {remedy}, or choose {place}"
-
-
-def as_bytes(error: UnicodeError) -> tuple[bytes, int]:
-    """Encodes what standard output has no letters for: bytes of file names as they are, all else as escapes.
-
-    Raises:
-        UnicodeError: it was to be read.
-    """
-    if not isinstance(error, UnicodeEncodeError):
-        raise error
-    letters = error.object[error.start : error.end]
-    return b"".join(map(byte_or_escape, letters)), error.end
-
-
-def byte_or_escape(letter: str) -> bytes:
-    """Returns a byte that Python took for no text (PEP 383), or the escape of a letter."""
-    number = ord(letter) - 0xDC00
-    return bytes([number]) if 0x80 <= number <= 0xFF else letter.encode("ascii", "backslashreplace")

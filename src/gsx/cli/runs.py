@@ -5,6 +5,7 @@ import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import Parser, positive, refuse_beyond, run_arguments, whole
@@ -15,6 +16,9 @@ from gsx.engine.collector import loading
 from gsx.experiments.runs.job import train
 from gsx.formats.axis_names import AUTO, CHOICES, SPECIFIED, TRAINED
 from gsx.formats.suffixes import READABLE, SPZ_VERSIONS, WRITTEN, splat_file_at, suffix_of
+
+if TYPE_CHECKING:
+    from gsx.formats.splat_files import SpzForm
 
 logger = logging.getLogger("gsx.cli")
 
@@ -57,11 +61,11 @@ def evaluate_file(path: Path, overrides: Sequence[str]) -> int:
 
 def verb_photographs(arguments: list[str]) -> int:
     """gsx photographs RUN [KEY=VALUE ...] [--worst N]"""
-    told = (
+    description = (
         "What is wrong with training photographs, told from what the trained model shows in their places: exposure, "
         "pose, blur, things that only one shows. The report then shows the worst."
     )
-    parser = Parser(prog="gsx photographs", description=told)
+    parser = Parser(prog="gsx photographs", description=description)
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
     parser.add_overrides("values that take the place of the run's own")
     parser.add_argument("--worst", type=positive(int), default=10, help="photographs that are shown (10)")
@@ -186,39 +190,23 @@ def verb_view(arguments: list[str]) -> int:
     return 0
 
 
-def add_spz_form(parser: Parser) -> None:
-    """Adds the flags that say how .spz is written."""
-    parser.add_argument(
-        "--axes",
-        choices=(SPECIFIED, TRAINED),
-        default=SPECIFIED,
-        help="of .spz: the specification's (rub), or as trained, as SuperSplat and splat-transform have it (rdf)",
-    )
-    parser.add_argument(
-        "--spz-version",
-        type=int,
-        choices=SPZ_VERSIONS,
-        default=SPZ_VERSIONS[0],
-        help="of .spz: 3, which more programs read, or 4, which states its axes (gsx[spz])",
-    )
-
-
-def refuse_spz_form(given: argparse.Namespace) -> None:
-    """Raises InputError for `gsx export` flags that are about .spz where another file is written."""
-    flags = {"--axes": (given.axes, SPECIFIED), "--spz-version": (given.spz_version, SPZ_VERSIONS[0])}
-    for flag, (value, usual) in flags.items():
-        if value != usual and (given.file is None or given.file.suffix.lower() != ".spz"):
-            raise InputError(f"gsx export: {flag} {value} is of .spz files: give one, for example model.spz")
-
-
 def verb_export(arguments: list[str]) -> int:
     """gsx export RUN|FILE [TO] [--view NAME] [--bake ZOOM] [--axes rub|rdf] [--spz-version 3|4] [--from-axes AXES]
     [--local]"""
     given = export_parser().parse_args(arguments)
-    refuse_export_options(given)
+    with loading():
+        from gsx.experiments.runs.export import refuse_export
+        from gsx.formats.splat_files import SpzForm
+
+    spz = SpzForm(version=given.spz_version, axes=given.axes)
+    refuse_export(given.file or Path("point_cloud.ply"), spz)
+    if given.bake:
+        refuse_beyond("gsx export --bake", given.bake, ZOOMS)
+    if given.view and given.bake:
+        raise InputError("gsx export: --view NAME is what one view draws, --bake ZOOM a file for all: give one of them")
     source = splat_file_at(given.run)
     is_file = bool(suffix_of(source)) and not source.is_dir()
-    sys.stdout.write(f"{converted(source, given) if is_file else exported(given)}\n")
+    sys.stdout.write(f"{converted(source, given, spz) if is_file else exported(given, spz)}\n")
     return 0
 
 
@@ -240,29 +228,27 @@ def export_parser() -> Parser:
         help="one standard file for all views of a model that decodes splats for each, as cameras see it at ZOOM times "
         "their resolution",
     )
-    add_spz_form(parser)
+    parser.add_argument(
+        "--axes",
+        choices=(SPECIFIED, TRAINED),
+        default=SPECIFIED,
+        help="of .spz: the specification's (rub), or as trained, as SuperSplat and splat-transform have it (rdf)",
+    )
+    parser.add_argument(
+        "--spz-version",
+        type=int,
+        choices=SPZ_VERSIONS,
+        default=SPZ_VERSIONS[0],
+        help="of .spz: 3, which more programs read, or 4, which states its axes (gsx[spz])",
+    )
     add_axes(parser, "--from-axes")
     parser.add_argument("--local", action="store_true", help="of a scene far from (0, 0, 0): positions relative to the "
                         "origin that it was trained around, which the file states where it can")  # fmt: skip
     return parser
 
 
-def refuse_export_options(given: argparse.Namespace) -> None:
-    """Raises InputError for options of `gsx export` that are out of range, or that do not go together."""
-    with loading():
-        from gsx.experiments.runs.export import refuse_export
-
-    if given.file:
-        refuse_export(given.file)
-    if given.bake:
-        refuse_beyond("gsx export --bake", given.bake, ZOOMS)
-    refuse_spz_form(given)
-    if given.view and given.bake:
-        raise InputError("gsx export: --view NAME is what one view draws, --bake ZOOM a file for all: give one of them")
-
-
-def exported(given: argparse.Namespace) -> Path:
-    """Writes the model of a run as a splat file or a page; return that.
+def exported(given: argparse.Namespace, spz: "SpzForm") -> Path:
+    """Writes the model of a run as a splat file or a page; returns that.
 
     Raises:
         InputError: an option is for splat files alone, or the format cannot hold the model.
@@ -273,7 +259,6 @@ def exported(given: argparse.Namespace) -> Path:
         from gsx.experiments.runs.export import export, is_page, losses, shown_views
         from gsx.experiments.runs.open import open_run
         from gsx.experiments.runs.render import view_named
-        from gsx.formats.splat_files import SpzForm
 
     if given.from_axes != AUTO:
         raise InputError(
@@ -286,7 +271,6 @@ def exported(given: argparse.Namespace) -> Path:
     remove_partial(path.parent, below=False)
     if given.local and not any(run.scene.origin):
         logger.info("--local changes nothing: %s was trained in its own coordinates", run.scene.name)
-    spz = SpzForm(version=given.spz_version, axes=given.axes)
     written = export(run, path, view.camera if view else None, spz, given.bake, given.local)
     if written:
         views = [view] if view else shown_views(run.scene)
@@ -297,20 +281,17 @@ def exported(given: argparse.Namespace) -> Path:
     return path
 
 
-def converted(source: Path, given: argparse.Namespace) -> Path:
-    """Writes the splats of a file as a file of another kind; return that.
+def converted(source: Path, given: argparse.Namespace, spz: "SpzForm") -> Path:
+    """Writes the splats of a file as a file of another kind; returns that.
 
     Raises:
         InputError: it names no file to write, an option is for runs alone, or the file cannot be read or written.
     """
     from gsx.experiments.runs.convert import convert
-    from gsx.formats.splat_files import SpzForm
 
     if given.file is None:
         raise InputError(f"gsx export {source}: name the file to write as well, for example model.ply")
     if given.view or given.bake:
         raise InputError(f"gsx export: --view and --bake are for runs, and {source} is a splat file: leave them out")
-    spz = SpzForm(version=given.spz_version, axes=given.axes)
     convert(source, given.file, given.from_axes, spz, given.local)
-    file: Path = given.file
-    return file
+    return Path(given.file)

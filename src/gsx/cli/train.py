@@ -3,14 +3,13 @@
 import logging
 import sys
 from contextlib import nullcontext, redirect_stdout
-from datetime import datetime
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import RESUME_FLAGS, run_arguments
-from gsx.cli.messages import complain, os_sentence
+from gsx.cli.messages import explained
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
 from gsx.engine.collector import loading
 from gsx.engine.processes import say, speaks
@@ -20,17 +19,8 @@ from gsx.experiments.runs.messages import set_up_logging
 logger = logging.getLogger("gsx.cli")
 
 HYDRA_FLAGS = (
-    "-m",
-    "--multirun",
-    "-sc",
-    "--shell-completion",
-    "--info",
-    "--hydra-help",
-    "--cfg",
-    "-c",
-    "-p",
-    "--package",
-    "--resolve",
+    *("-m", "--multirun", "-sc", "--shell-completion", "--info", "--hydra-help"),
+    *("--cfg", "-c", "-p", "--package", "--resolve"),
 )
 """Flags that are handed to Hydra as they are."""
 
@@ -56,9 +46,9 @@ def verb_train(arguments: list[str]) -> int:
 
 
 def tell_report(code: int, *folders: Path) -> int:
-    """Says where the report of a run is that has come to its end; returns the exit code."""
-    if code == 0:
-        say("".join(f"{folder / 'report.html'}\n" for folder in folders))
+    """Prints the report of a run that has come to its end; returns the exit code."""
+    for folder in folders if code == 0 else ():
+        say(f"{folder / 'report.html'}\n")
     return code
 
 
@@ -80,6 +70,7 @@ def hand_to_hydra(arguments: list[str]) -> int:
     with loading():
         from gsx.experiments.runs.launched import waiting_for_all
         from gsx.experiments.runs.multirun import check_overrides, hydra_main, launch
+        from gsx.experiments.runs.open import stamped_folder
         from gsx.experiments.runs.overrides import quoted, with_quoted_paths
         from gsx.experiments.tables.sweep import is_table
 
@@ -97,7 +88,7 @@ def hand_to_hydra(arguments: list[str]) -> int:
     given = with_quoted_paths([word for word in arguments if not word.startswith("-")])
     refuse_for_sweeps(arguments)
     output, of_launcher = check_overrides(given, loaded)
-    sweep, code = new_sweep(output), 0
+    sweep, code = stamped_folder(output / "sweeps"), 0
     try:
         with waiting_for_all(sweep):
             launch(["-m", *given, *of_launcher, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
@@ -110,23 +101,12 @@ def hand_to_hydra(arguments: list[str]) -> int:
 
 
 def refuse_for_sweeps(arguments: list[str]) -> None:
-    """Raises ConfigError for flags that train nothing, and for what gsx says itself of a multirun."""
+    """Raises ConfigError for flags that train nothing, and for the place of a multirun's record."""
     for word in arguments:
         if word.startswith("-") and word not in ("-m", "--multirun"):
             raise ConfigError(f"-m trains several runs, and {word} trains none: leave one of them out")
         if word.lstrip("+").startswith("hydra.sweep.dir="):
             raise ConfigError(f"'{word}': a multirun's record goes below output/sweeps; give output=FOLDER")
-
-
-def new_sweep(output: Path) -> Path:
-    """Makes a new folder for the record of a multirun."""
-    for number in range(1, 1000):
-        stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-        folder = output / "sweeps" / (stamp if number == 1 else f"{stamp}_{number}")
-        if not folder.exists():
-            folder.mkdir(parents=True)
-            return folder
-    raise InputError(f"no free folder below {output / 'sweeps'}: clean it up")
 
 
 def close_sweep(sweep: Path) -> int:
@@ -161,10 +141,8 @@ def sweep_job(config: Any) -> int:
         if not is_launched():
             raise
         code = INTERRUPTED
-    except GsxError as error:
-        code = complain(str(error))
-    except OSError as error:
-        code = complain(os_sentence(error))
+    except (GsxError, OSError) as error:
+        code = explained(error)
     except Exception:  # a defect, perhaps a plugin's: the other jobs are worth no less
         logger.exception("this job failed")
         code = 1
@@ -179,12 +157,12 @@ def sweep_job(config: Any) -> int:
 
 def verb_resume(arguments: list[str]) -> int:
     """gsx resume RUN [KEY=VALUE ...] [--trust] [--changed]"""
-    told = (
+    description = (
         "Go on where a run stopped, bit for bit; iterations=N lengthens it. --trust: also with code that RUN names. "
         "--changed: also where cameras or config.yaml are no longer what it began with."
     )
     words = [word for word in arguments if word not in RESUME_FLAGS]
-    folder, overrides = run_arguments("resume", words, told, "".join(f" [{flag}]" for flag in RESUME_FLAGS))
+    folder, overrides = run_arguments("resume", words, description, "".join(f" [{flag}]" for flag in RESUME_FLAGS))
     with loading():
         from gsx.engine.cache import in_use
         from gsx.experiments.run_folder.claims import claimed

@@ -224,4 +224,4 @@ def test_a_file_is_converted_from_given_axes_into_version_4(
 
 def test_flags_of_spz_for_another_file_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(tmp_path / "run"), str(tmp_path / "a.ply"), "--spz-version", "4"]) == 2
-    assert "--spz-version 4 is of .spz files" in capsys.readouterr().err
+    assert "version are of .spz files" in capsys.readouterr().err

@@ -12,7 +12,7 @@ from torch import Tensor
 from gsx import __version__
 from gsx.core.data.camera import Camera, upright
 from gsx.core.data.scene import Scene, View
-from gsx.core.errors import GsxError
+from gsx.core.errors import GsxError, InputError
 from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.quality.metrics import psnr
@@ -128,10 +128,12 @@ def is_page(path: Path) -> bool:
     return path.suffix.lower() == PAGE
 
 
-def refuse_export(path: Path) -> None:
-    """Raises InputError if the name promises a format that is not written."""
+def refuse_export(path: Path, spz: SpzForm = SPZ_FORM) -> None:
+    """Raises InputError for a name whose format is not written, and for a form of .spz of another file."""
     if not is_page(path):
         refuse_suffix(path, (PAGE,))
+    if spz != SPZ_FORM and suffix_of(path) != ".spz":
+        raise InputError(f"axes and version are of .spz files, not of {path}: leave them out, or write model.spz")
 
 
 def page_of(run: Run, gaussians: Gaussians, comments: Sequence[str]) -> str:

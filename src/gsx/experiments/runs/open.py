@@ -59,26 +59,29 @@ def refuse_used(folder: str, remedy: str = "") -> None:
 
 
 def new_folder(settings: Settings, scene: Scene) -> Path:
-    """Makes a fresh run folder.
-
-    Raises:
-        InputError: no free name was found.
-    """
+    """Makes the folder of a new run."""
     if settings.general.folder:
         folder = Path(settings.general.folder)
         folder.mkdir(parents=True, exist_ok=True)
         keep_names(folder.parent)
         return folder
-    parent = Path(settings.general.output) / scene.name / settings.backbone.component.name
+    folder = stamped_folder(Path(settings.general.output) / scene.name / settings.backbone.component.name)
+    keep_names(folder.parent)
+    return folder
+
+
+def stamped_folder(parent: Path) -> Path:
+    """Makes a folder named by the time.
+
+    Raises:
+        InputError: no free name was found.
+    """
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     for suffix in ("", *(f"_{n}" for n in range(2, 1000))):
-        try:
+        with suppress(FileExistsError):  # another began in the same second
             (parent / (stamp + suffix)).mkdir(parents=True)
-        except FileExistsError:  # another run began in the same second
-            continue
-        keep_names(parent)
-        return parent / (stamp + suffix)
-    raise InputError(f"no free run folder below {parent}: clean it up or set folder=NEW_FOLDER")
+            return parent / (stamp + suffix)
+    raise InputError(f"no free folder below {parent}: clean it up or set folder=NEW_FOLDER")
 
 
 @gc_paused()
