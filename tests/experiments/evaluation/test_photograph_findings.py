@@ -173,12 +173,13 @@ def test_the_photographs_that_a_model_did_not_take_are_named(run: Run) -> None:
         camera = replace(view.camera, cx=view.camera.cx + 2) if number == 3 else view.camera
         pictures[view.name] = render(run, camera, PIXELS).image.detach().clamp(0, 1) * (0.5 if number == 1 else 1)
     pictures[views[5].name][:, 8:16, 16:24] = 1.0
-    scene = run.scene
-    run.scene = replace(scene, train=[replace(view, source=Taken(pictures[view.name])) for view in views])
+    before = run.views
+    photos = [replace(view, source=Taken(pictures[view.name])) for view in views]
+    run.views = replace(before, scene=replace(run.scene, train=photos))
     try:
         found = {one.name: one for one in findings_of(run, PIXELS)}
     finally:
-        run.scene = scene
+        run.views = before
     dark, shifted, covered = (found[views[number].name] for number in (1, 3, 5))
     assert {name for name, one in found.items() if one.remarks} == {dark.name, shifted.name, covered.name}
     assert dark.gains == pytest.approx((-1, -1, -1), abs=0.05)

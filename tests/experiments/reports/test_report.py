@@ -89,6 +89,7 @@ def curve_lines() -> list[dict[str, Any]]:
         for s in range(10, 1001, 10)
     ]
     lines[29] |= {"opacity_resets": 1}
+    lines[39] |= {"steps_left_out": 150}
     lines[59] |= {"skipped": "loss is not finite"}
     lines[49] |= {"test_psnr": 17.0}
     lines[99] |= {"test_psnr": 24.0}
@@ -177,6 +178,10 @@ def test_headline_figures(page: Page) -> None:
     text = page.text("figures")
     for words in ("24.25 dB", "0.9000 inria", "n/a no weights", "123,456", "29.1 MB", "12.5 fps", "12 min", "812 MB"):
         assert words in text
+
+
+def test_steps_that_were_skipped_are_counted(page: Page) -> None:
+    assert "steps 1,000 of 1,000, 150 steps skipped" in " ".join(page.texts[""].split())
 
 
 def test_zoom_verdicts_say_what_they_mean(page: Page) -> None:
