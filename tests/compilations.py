@@ -12,13 +12,13 @@ from gsx.engine.compile_cache import KeptFunction
 @contextmanager
 def new_code() -> Iterator[list[str]]:
     """Names of the functions for which code is made or loaded from now on, by whichever way."""
-    names, found_before = list[str](), KeptFunction.found
+    names, find = list[str](), KeptFunction.find
 
     def found(self: KeptFunction, *given: object) -> object:
         names.append(self.function.__name__)
-        return found_before(self, *given)
+        return find(self, *given)
 
     graphs = torch._dynamo.utils.counters["stats"]["unique_graphs"]
-    with patch.object(KeptFunction, "found", found):
+    with patch.object(KeptFunction, "find", found):
         yield names
     names += ["of torch"] * (torch._dynamo.utils.counters["stats"]["unique_graphs"] - graphs)

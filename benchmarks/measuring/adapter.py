@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.shapes import Float
 from gsx.engine import compiled
 from gsx.engine.compiled import composite_compiled
+from gsx.engine.kernels import Kernels, Rules
 from gsx.experiments.runs.compose import compose
 from measuring.stages import StageClock
 
@@ -71,17 +72,19 @@ def blend_screen(
 
 @contextmanager
 def loops_timed() -> Iterator[dict[str, float]]:
-    """Seconds spent in each compiled loop over blocks since the context began, by name."""
-    clock, settled = StageClock(), compiled.settled
+    """Yields the seconds spent in each compiled loop over blocks since the context began, by name."""
+    clock, kernels = StageClock(), compiled.kernels
 
-    def watched(loop: Any) -> Any:
-        return clock.clocked(loop.kept.function.__name__, settled(loop))
+    def clocked(rules: Rules) -> Kernels:
+        loops = kernels(rules)
+        names = ("transmit", "blend", "gradients")
+        return replace(loops, **{name: clock.clocked(name, getattr(loops, name)) for name in names})
 
-    compiled.settled = watched  # type: ignore[assignment]
+    compiled.kernels = clocked  # type: ignore[assignment]
     try:
         yield clock.seconds
     finally:
-        compiled.settled = settled
+        compiled.kernels = kernels
 
 
 def to_raster(tiles: Float[Tensor, "T P C"], camera: Camera, tile: int) -> Float[Tensor, "C H W"]:

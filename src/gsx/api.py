@@ -31,7 +31,7 @@ from gsx.core.shapes import Float
 from gsx.core.training.render import render, render_gaussians
 from gsx.core.training.run import Run
 from gsx.engine.processes import processes
-from gsx.engine.threads import relieve_oversubscription
+from gsx.engine.threads import watch_cores
 from gsx.experiments.runs.again import evaluate_again
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.export import export, refuse_export
@@ -83,7 +83,6 @@ class TrainedRun:
         """
         return self.run.scene
 
-    @relieve_oversubscription()
     def render(self, seen: Camera | View | str, zoom: float = 1) -> Float[Tensor, "3 H W"]:
         """Returns the model as a camera, a view, or the view of that name sees it; colours in [0, 1].
 
@@ -143,7 +142,6 @@ class SplatFile:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Subtracted from `gaussians`, whose file lies far from (0, 0, 0); `render` moves cameras likewise."""
 
-    @relieve_oversubscription()
     def render(
         self, seen: Camera | View, background: Sequence[float] | Float[Tensor, "3"] = (0, 0, 0)
     ) -> Float[Tensor, "3 H W"]:
@@ -227,6 +225,7 @@ def load(
         return load_run(path)
     if not path.exists():
         raise InputError(f"'{path}' does not exist: give a run folder or a splat file")
+    watch_cores()
     gaussians, subtracted = read_around(path, axes, origin)
     return SplatFile(path, gaussians, raster or rules_of(path), subtracted)
 

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import pytest
@@ -20,6 +21,7 @@ from gsx.engine.cache import (
     entries,
     file_stamp,
     in_use,
+    made_by_one,
     make_folder,
     trim,
     whole,
@@ -223,3 +225,22 @@ def test_where_there_is_no_home_a_place_is_asked_for(monkeypatch: pytest.MonkeyP
 
 def homeless(path: Path) -> Path:
     raise RuntimeError("Could not determine home directory.")
+
+
+def test_waiting_for_another_process_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    file, got = tmp_path / "blend-0123.bin", list[bool]()
+
+    def wait() -> None:
+        with made_by_one(file, wait=True) as alone:
+            got.append(alone)
+
+    caplog.set_level("INFO", "gsx")
+    thread = Thread(target=wait)
+    with made_by_one(file) as alone:
+        thread.start()
+        deadline = time.monotonic() + 60
+        while not caplog.messages and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert (alone, got) == (True, [])
+    thread.join(60)
+    assert (got, caplog.messages) == ([True], ["waiting for another process, which is making blend ..."])

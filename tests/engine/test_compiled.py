@@ -263,7 +263,8 @@ def test_what_goes_the_eager_way() -> None:
 BROKEN = """
 import torch
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.experiments.runs.rasterizer_path import decide, warm_splats
+from gsx.engine.compile_ahead import warm_splats
+from gsx.experiments.runs.rasterizer_path import decide
 from gsx.core.data.camera import look_at
 import logging
 logging.basicConfig(level=logging.INFO, format="%(message)s")

@@ -89,6 +89,7 @@ class Anchors:
     ) -> None:
         scene, points = context.scene, context.points()
         self.options, self.representation, self.sh, self.scene = options, representation, sh, scene
+        self.sh_degree = sh[0]
         self.network_rates, self.extent, self.views = network_rates, scene.extent, context.views
         self.quirks = options.switches()
         self.cameras = [view.camera for view in scene.train]

@@ -95,7 +95,7 @@ class GS3D:
         self.filter = filter_named(options.filter, options.mip, context, self.schedule, self.control.ends())
         self.raster = self.filter.rules(context.raster)
         self.absolute_gradient = density.absolute or self.capacity.ranked
-        self.first_degree = 0
+        self.first_degree, self.sh_degree = 0, options.sh_degree
         self.table = self.initial_table(context.points(), context.device)
         self.filter.refresh(self.table, self.table["means"])
 

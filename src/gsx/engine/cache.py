@@ -57,10 +57,15 @@ def content_key(*parts: object) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:KEY_LETTERS]
 
 
-def source_digest(folder: Path) -> str:
-    """Digests the Python files below a folder: other code may give other results."""
+def source_files(*places: Path) -> list[Path]:
+    """Lists the Python files below folders, and files themselves, in order."""
+    return sorted(path for place in places for path in (place.rglob("*.py") if place.is_dir() else [place]))
+
+
+def source_digest(*places: Path) -> str:
+    """Digests Python files and those below folders: other code may give other results."""
     digest = hashlib.sha256()
-    for path in sorted(folder.rglob("*.py")):
+    for path in source_files(*places):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 

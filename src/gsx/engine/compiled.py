@@ -19,7 +19,7 @@ from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.settings import NOTHING, RasterSettings
 from gsx.core.shapes import Float, Int
 from gsx.engine.compile_cache import recording
-from gsx.engine.compiling import available, settled
+from gsx.engine.compiling import available
 from gsx.engine.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels, seen_from_front
 from gsx.engine.lanes import LANES, Lanes, centres, from_lanes, lay_out, places_of, to_lanes
 from gsx.engine.path import warn_once
@@ -172,7 +172,7 @@ def blend_stage(job: Job, blend: Callable[..., None], stage: Stage, accumulated:
 
 def shares(job: Job, rows: Rows, like: Float[Tensor, "G P L"]) -> Float[Tensor, "G P L"]:
     """Share of the light that passes each list which another piece follows, and some others; 1 elsewhere."""
-    transmit, passed = settled(job.loops.transmit), Rows(torch.ones_like(like))
+    transmit, passed = job.loops.transmit, Rows(torch.ones_like(like))
     followed = max(int(groups.max()) + 1 for _, (groups, _) in job.lanes.follows)  # the longest lists, hence first
     for part in parts(max(2, followed), job.batch):
         for base in job.lanes.bases:
@@ -215,7 +215,7 @@ def blend_chunks(
         passed = shares(job, held, inside)
         front, pieces = in_front(job.lanes, passed, inside), (passed, lights)
     kept = Chunks([], held, Rows(front), Rows(inside.new_empty(len(rows), *inside.shape[1:])), pieces)
-    blend = settled(job.loops.blend)
+    blend = job.loops.blend
     for batch in parts(len(inside), job.batch):
         number, left = 0, None
         while (stage := stage_of(job, number, batch, left)) is not None:
@@ -245,7 +245,7 @@ def chunk_gradients(job: Job, kept: Chunks, gradient: list[Float[Tensor, "G P L"
     """Gradient of every entry, back to front; zero for blocks that were not blended."""
     seen, behind, basis = [Rows(channel) for channel in gradient], Rows(behind_lists(job, kept, gradient)), job.basis
     found = Rows(room_for_gradients(kept, TABLE + job.rules.channels + 2 * job.rules.absolute))
-    gradients = settled(job.loops.gradients)
+    gradients = job.loops.gradients
     for stage in reversed(kept.stages):
         rest, part = behind.take(stage.groups), found.take(stage.blocks)
         given = kept.before(stage), rest, [channel.take(stage.groups) for channel in seen], part

@@ -9,7 +9,7 @@ from tiny import tiny_settings
 from gsx.builtin import plugins
 from gsx.core.training import trainer
 from gsx.core.training.run import Run, Sampler
-from gsx.engine.compile_cache import counted
+from gsx.engine.compile_cache import training_clock, waiting
 from gsx.experiments.runs.open import start
 
 
@@ -43,10 +43,10 @@ def test_waiting_for_code_is_no_training(tmp_path: Path, monkeypatch: pytest.Mon
     def step(run: Run, _: object) -> None:
         run.step += 1
         now[0] += 2
-        with counted():
+        with waiting():
             now[0] += 10 if run.step == 2 else 0
 
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
     monkeypatch.setattr(trainer, "train_step", step)
-    trainer.train(run, plugins())
+    trainer.train(run, plugins(), training_clock)
     assert (run.step, run.seconds) == (3, 6.0)

@@ -4,8 +4,9 @@ import torch
 from torch import Tensor
 
 from gsx.core.shapes import Int
-from gsx.engine.threads import GRAIN
 
+GRAIN = 1 << 15
+"""Numbers from which torch uses another thread (ATen, at::internal::GRAIN_SIZE)."""
 BY_DIGITS = GRAIN
 """Keys from which torch sorts by their digits on a CPU, in a fifth of the time that comparing them takes, as it does
 with fewer (ATen, native/cpu/SortingKernel.cpp)."""

@@ -208,6 +208,14 @@ class PseudoViewListener(Protocol):
 
 
 @runtime_checkable
+class WithHarmonics(Protocol):
+    """A backbone whose colours change with direction, by spherical harmonics."""
+
+    sh_degree: int
+    """Highest degree of its colours; code for it is compiled before the first step."""
+
+
+@runtime_checkable
 class WithOwnFile(Protocol):
     """A backbone whose published code writes splat files with more in them than standard ones."""
 

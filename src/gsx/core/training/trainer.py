@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -25,24 +25,23 @@ from gsx.core.training.parameter_table import zero_grad
 from gsx.core.training.pseudo_terms import backward_terms, request_terms, reusable_parts, reused_losses, without_windows
 from gsx.core.training.pseudo_views import Term
 from gsx.core.training.run import Run, StepResult
-from gsx.engine.compile_cache import waiting_counted
-from gsx.engine.threads import relieve_oversubscription
 
 logger = logging.getLogger(__name__)
 
 
-@relieve_oversubscription()
-def train(run: Run, plugins: Plugins) -> None:
-    """Take steps until the run is complete or one of its ranks asked to stop; listeners hear of each."""
+def train(run: Run, plugins: Plugins, clock: Callable[[], float] = time.perf_counter) -> None:
+    """Takes steps until the run is complete or one of its ranks asked to stop; listeners hear of each.
+
+    `clock`: seconds that count as training time.
+    """
     plugins.emit.gsx_run_started(run=run)
     while not (run.complete or any(run.ranks.all_gather(run.stopping))):
-        begun = time.perf_counter()
+        start = clock()
         try:
-            with waiting_counted() as waited:
-                step = train_step(run, plugins)
+            step = train_step(run, plugins)
         except Stopped:
             break
-        run.seconds += time.perf_counter() - begun - waited.seconds
+        run.seconds += clock() - start
         plugins.emit.gsx_step_finished(run=run, step=step)
     run.photographs.see(())
     plugins.emit.gsx_training_finished(run=run)

@@ -17,7 +17,6 @@ from gsx.core.plugins import Plugins
 from gsx.core.seeds import derived_seed
 from gsx.core.training import checkpoint
 from gsx.core.training.run import Run
-from gsx.engine.threads import relieve_oversubscription
 from gsx.experiments.compact.shrink import (
     Shrinking,
     ShrinkOptions,
@@ -59,7 +58,6 @@ NAME, COMPARED = "compact.json", "compared"
 """What was tried; folder of the page with the model before and after."""
 
 
-@relieve_oversubscription()
 def compact(
     target: Path, to: Path, max_drop: float, steps: int | None, overrides: Sequence[str], plugins: Plugins
 ) -> Path:
@@ -71,7 +69,7 @@ def compact(
     refuse_used(str(to), ELSEWHERE)
     run, settings = opened(target, overrides, plugins)
     with claimed_anew(to):
-        warm(run, settings)
+        warm(run)
         steps = max(1, round(SHARE * run.iterations)) if steps is None else steps
         generator = torch.Generator().manual_seed(derived_seed("compact", settings.general.seed))
         shrinking = Shrinking(run, ShrinkOptions(max_drop=max_drop, steps=steps), plugins, generator)

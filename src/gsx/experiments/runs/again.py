@@ -27,7 +27,7 @@ def evaluate_again(folder: Path, plugins: Plugins, overrides: Sequence[str] = ()
         remove_partial(folder)
         run, settings = open_run(folder, plugins, overrides)
         run.raster = as_trained(run)
-        warm(run, settings)
+        warm(run)
         if run.complete:
             return finish(run, settings, plugins)
         evaluation = evaluate(run, settings)

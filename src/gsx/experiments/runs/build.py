@@ -26,6 +26,7 @@ from gsx.core.training.training_views import TrainingViews
 from gsx.engine.allocator import keep_freed_memory
 from gsx.engine.cache import MANIFEST, cache_folder, content_key, make_folder
 from gsx.engine.machine import processor_kind
+from gsx.engine.threads import watch_cores
 from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.halves import Anew, held_out_renders
 from gsx.experiments.runs.rasterizer_path import decide
@@ -97,7 +98,8 @@ ALONE = Ranks()
 
 
 def prepare_process(device: torch.device, training: bool) -> None:
-    """What holds for the whole process: how memory is kept and counted, and where compiled code lies."""
+    """Prepares the whole process: how memory is kept and counted, where compiled code lies, how threads wait."""
+    watch_cores()
     if training and device.type == "cpu":
         keep_freed_memory()
     if device.type == "cuda":

@@ -7,7 +7,6 @@ from typing import Any
 from gsx.core.errors import TooManyPairs, first_line
 from gsx.core.files import write_json
 from gsx.core.training.run import Run
-from gsx.engine.threads import relieve_oversubscription
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.remarks import measures_nothing, remarks_of
@@ -22,7 +21,6 @@ from gsx.experiments.runs.settings import Settings
 logger = logging.getLogger(__name__)
 
 
-@relieve_oversubscription()
 def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     """Writes evaluation.json and the pictures of a run."""
     options, begun = settings.evaluation, time.perf_counter()

@@ -14,6 +14,7 @@ from gsx.core.training.guard import Agreement, Guard
 from gsx.core.training.run import Run, StepResult
 from gsx.core.training.trainer import train
 from gsx.engine.cache import cache_root, trim
+from gsx.engine.compile_cache import training_clock
 from gsx.experiments.evaluation.remarks import CapNotice
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.files import SPLATS
@@ -75,7 +76,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins, keep_states: bool = 
             plugins.listening([*listeners, *viewers]),
             announce_failure(run, plugins),
         ):
-            train(run, plugins)
+            train(run, plugins, training_clock)
             if run.complete:
                 finish(run, settings, plugins)
     except BaseException as error:
@@ -96,7 +97,7 @@ def warm_or_eager(run: Run, settings: Settings) -> None:
         CompilerError: elsewhere.
     """
     try:
-        warm(run, settings)
+        warm(run)
     except CompilerError as error:
         chosen_by_gsx = settings.raster.path == "auto" and run.raster.path == "compiled"
         if not chosen_by_gsx or run.step > 0 or run.ranks.size > 1:
@@ -150,9 +151,9 @@ def problems_logged(what: str) -> Iterator[None]:
 
 def follow(run: Run, settings: Settings, plugins: Plugins) -> None:
     """Trains as the first process does, and writes nothing."""
-    warm(run, settings, helped=False)
+    warm(run, helped=False)
     with plugins.listening([Guard(), Agreement()]):
-        train(run, plugins)
+        train(run, plugins, training_clock)
 
 
 def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:

@@ -22,7 +22,6 @@ from gsx.core.shapes import Float
 from gsx.core.training.backbone import Bakeable, WithOwnFile
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.engine.threads import relieve_oversubscription
 from gsx.experiments.reports.viewer_page import viewer_page
 from gsx.experiments.runs.bake import bake
 from gsx.experiments.runs.coordinates import COMMENTED, log_coordinates, placement, refuse_too_far
@@ -56,7 +55,6 @@ class Exported:
     """They stand for a model that has others for every camera."""
 
 
-@relieve_oversubscription()
 def export(
     run: Run, path: Path, camera: Camera | None = None, spz: SpzForm = SPZ_FORM, zoom: float = 0, local: bool = False
 ) -> Exported | None:
@@ -188,7 +186,6 @@ def render_mode(raster: RasterSettings) -> str:
     return "mip" if raster.compensate else "default"
 
 
-@relieve_oversubscription()
 def losses(
     run: Run,
     settings: Settings,

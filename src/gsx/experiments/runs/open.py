@@ -26,14 +26,13 @@ from gsx.experiments.run_folder.files import RunFiles, read_run
 from gsx.experiments.run_folder.run_key import composition_key, finished, other_revision, place_of, trained_on
 from gsx.experiments.run_folder.shapes import is_number
 from gsx.experiments.runs import warm_start
-from gsx.experiments.runs.build import build, choose_device, prepare_compiling, refuse_uneven
+from gsx.experiments.runs.build import build, choose_device, refuse_uneven
 from gsx.experiments.runs.environment import environment
 from gsx.experiments.runs.file_axes import start_in_scene
 from gsx.experiments.runs.history import go_on
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.overrides import key_of
 from gsx.experiments.runs.progress import read_curves
-from gsx.experiments.runs.rasterizer_path import help_at_once
 from gsx.experiments.runs.saved_settings import read_config, value_of, write_config
 from gsx.experiments.runs.settings import Settings, named_code
 from gsx.experiments.runs.start_file import starting_splats
@@ -94,12 +93,9 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
         ConfigError, InputError: something is wrong; no folder was made.
     """
     ranks = ranks_here()
-    device = choose_device(settings.general.device)
+    choose_device(settings.general.device)  # an unknown one is refused now
     ranks.broadcast(lambda: refuse_used(settings.general.folder))
     refuse_uneven(settings.training.batch, ranks)
-    if claims is not None and ranks.first:
-        prepare_compiling()
-        claims.enter_context(help_at_once(settings, device))
     load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
     build_trackers(settings.trackers)  # the same: a missing package
     if settings.general.viewer:

@@ -20,7 +20,6 @@ from gsx.core.shapes import Float
 from gsx.core.training.module import TrainingModule
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.engine.threads import relieve_oversubscription
 from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on
 from gsx.experiments.reports.pictures import Pictures, file_names, forget
 from gsx.experiments.reports.report import write_report
@@ -35,7 +34,6 @@ FOLDER = "photographs"
 """Of the run's, with index.json and pictures of the worst."""
 
 
-@relieve_oversubscription()
 def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Sequence[str] = ()) -> list[Finding]:
     """Returns findings on all training photographs of a run, worst first.
 
@@ -51,7 +49,7 @@ def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Seq
     with claimed(folder):
         run, settings = open_run(folder, plugins, overrides)
         run.raster = as_trained(run)
-        warm(run, settings)
+        warm(run)
         findings = findings_of(run, settings.evaluation.tile_pixels)
         write_findings(run, findings, worst, settings.evaluation.tile_pixels)
         write_report(folder)

@@ -15,7 +15,7 @@ from gsx.core.files import remove_partial
 from gsx.core.shapes import Float
 from gsx.core.training.render import render, render_gaussians
 from gsx.core.training.run import Run
-from gsx.engine.threads import relieve_oversubscription
+from gsx.engine.threads import watch_cores
 from gsx.experiments.reports.pictures import file_names
 from gsx.experiments.runs.orbit import orbit_cameras, write_animation
 from gsx.experiments.runs.settings import Settings
@@ -42,7 +42,6 @@ def view_named(run: Run, name: str) -> View:
     return views[name]
 
 
-@relieve_oversubscription()
 def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -> None:
     """Writes every test view at `zoom` times the training resolution as PNG.
 
@@ -62,7 +61,6 @@ def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -
     without_others(folder, "*.png", names, run.folder)
 
 
-@relieve_oversubscription()
 def render_orbit(run: Run, settings: Settings, path: Path, frames: int, fps: float, zoom: float) -> None:
     """Animates a closed path around the scene."""
     remove_partial(path.parent, below=False)
@@ -89,6 +87,7 @@ def file_pictures(path: Path, cameras: Sequence[Camera] = (), axes: str = AUTO) 
     Raises:
         InputError: it cannot be read, or no splat is in view of any of the cameras.
     """
+    watch_cores()
     (gaussians, origin), raster = read_around(path, axes), rules_of(path)
     if cameras:
         refuse_nothing_in_view(
@@ -97,7 +96,6 @@ def file_pictures(path: Path, cameras: Sequence[Camera] = (), axes: str = AUTO) 
     return lambda camera: render_gaussians(gaussians, moved(camera, origin), raster, torch.zeros(3))
 
 
-@relieve_oversubscription()
 def render_path(
     way: CameraPath, draw: Draw, to: Path, movie: bool, zoom: float, run_folder: Path | None = None
 ) -> Path:

@@ -9,7 +9,7 @@ from gsx.core.errors import CheckpointError, InputError
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training import checkpoint
-from gsx.engine.threads import relieve_oversubscription
+from gsx.engine.threads import watch_cores
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.progress import read_curves
@@ -58,7 +58,6 @@ class Watched:
         return f"{told_of(self.run)}, {state_of(read_run(self.run.folder))[0]}"
 
 
-@relieve_oversubscription()
 def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Callable[[str], None]) -> None:
     """Shows a run until Ctrl-C.
 
@@ -75,9 +74,9 @@ def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Cal
         viewer.stop()
 
 
-@relieve_oversubscription()
 def view_file(path: Path, axes: str, host: str, port: int, announce: Callable[[str], None]) -> None:
     """Shows a splat file until Ctrl-C; axes: the file's. Errors as `view_run`."""
+    watch_cores()
     gaussians, origin = read_around(path, axes)
     if not len(gaussians.means):
         raise InputError(f"{path} holds no splats: choose another file")

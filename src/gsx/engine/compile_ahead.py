@@ -1,0 +1,146 @@
+"""What a training step needs is compiled before the first step; a second process compiles half of it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from threading import Thread
+
+import torch
+from torch.nn import Parameter
+
+from gsx.core.data.camera import Camera, look_at
+from gsx.core.gaussians.sh import colours_of
+from gsx.core.gaussians.splats import Splats
+from gsx.core.quality.losses import photometric
+from gsx.core.rasterizer import RasterSettings, rasterize
+from gsx.engine.compile_cache import Call, lacking, make_ahead, place, recorded
+
+WARM_SPLATS, WARM_SIZE = 2000, (128, 96)
+"""Of the picture whose drawing compiles everything: lists of several chunks in several groups."""
+HELPER = "import sys; from gsx.engine.compile_ahead import help_compiling; help_compiling(sys.argv[1])"
+"""The second process."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step:
+    """What the code of a step depends on: the rules of the rasterizer and the backbone."""
+
+    settings: RasterSettings
+    sh_degree: int = 0
+    """Degree of the harmonics by which colours change with direction."""
+    absolute_gradient: bool = False
+    """Whether the backbone wants absolute gradients of screen means."""
+
+
+def compile_ahead(
+    step: Step, device: torch.device, helped: bool = True, stopping: Callable[[], bool] = lambda: False
+) -> float:
+    """Compiles all that a step needs and that is not kept, until `stopping`; returns the seconds that it took.
+
+    `helped`: by a second process on a CPU.
+    """
+    start = time.perf_counter()
+    calls = needed(step, device)
+    missing = lacking(calls)
+    if missing:
+        with helper(step, helped and len(missing) > 1 and place() is not None):
+            make_ahead(calls, stopping)
+            if not stopping():
+                draw_one(step, device)
+    return time.perf_counter() - start
+
+
+def needed(step: Step, device: torch.device) -> list[Call]:
+    """Lists the compiled calls of a step; on a GPU they are compiled by now, and there are none."""
+    with recorded() as calls:
+        draw_one(step, device)
+    return calls
+
+
+def draw_one(step: Step, device: torch.device) -> None:
+    """Takes a small picture through all that a step compiles."""
+    splats, degree = warm_splats(device), step.sh_degree
+    rest = Parameter(torch.zeros(len(splats), (degree + 1) ** 2 - 1, 3, device=device))
+    colours = colours_of(splats.colours[:, None], rest, splats.means, degree, compiled=True)
+    as_training = replace(step.settings, training_focal=0.0)
+    drawn = replace(splats, colours=colours)
+    image = rasterize(drawn, warm_camera(), as_training, absolute_gradient=step.absolute_gradient).image
+    photometric(image, torch.zeros(image.shape, device=device), 0.2, compiled=True).backward()
+
+
+def warm_camera() -> Camera:
+    """Returns the camera of the small picture."""
+    return look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=WARM_SIZE[0], height=WARM_SIZE[1])
+
+
+def warm_splats(device: torch.device) -> Splats:
+    """Draws faint splats before the camera from a generator of their own: a run's randomness stays untouched."""
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(WARM_SPLATS, 3, generator=generator) * 2 - 1
+    fields = {
+        "means": means,
+        "scales": torch.full_like(means, 0.05),
+        "quats": torch.tensor([1.0, 0, 0, 0]).repeat(WARM_SPLATS, 1),
+        "log_opacities": torch.full((WARM_SPLATS,), -2.0),
+        "colours": torch.rand(WARM_SPLATS, 3, generator=generator),
+    }
+    return Splats(**{name: value.to(device).requires_grad_() for name, value in fields.items()})
+
+
+# -- the second process ------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def helper(step: Step, wanted: bool = True) -> Iterator[None]:
+    """Runs a process that compiles the calls of a step from the last to the first, as long as the context lasts.
+
+    There is none if this process has a single thread, or where the system starts no other.
+    """
+    process = None
+    if wanted and torch.get_num_threads() > 1:
+        words = json.dumps(asdict(step) | {"threads": torch.get_num_threads()})
+        with suppress(OSError):
+            process = subprocess.Popen(
+                [sys.executable, "-P", "-c", HELPER, words],
+                stdin=subprocess.PIPE,  # its end tells the process to stop, also if this one is killed
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,  # Ctrl-C is for this process alone
+            )
+    try:
+        yield
+    finally:
+        if process is not None:
+            end(process)
+
+
+def end(process: subprocess.Popen[bytes]) -> None:
+    """Ends a helper and its compilers; SIGTERM lets these remove unfinished files."""
+    if os.name == "posix":
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGTERM)
+    process.terminate()
+    process.communicate()
+
+
+def help_compiling(words: str) -> None:
+    """Compiles the calls of a step from the last to the first, until standard input ends."""
+    Thread(target=end_with_input, daemon=True).start()
+    fields = json.loads(words)
+    torch.set_num_threads(fields.pop("threads"))
+    step = Step(**fields | {"settings": RasterSettings(**fields["settings"])})
+    make_ahead(needed(step, torch.device("cpu"))[::-1])
+
+
+def end_with_input() -> None:
+    """Ends this process and its compilers when standard input ends, since the process that began it is gone."""
+    sys.stdin.buffer.read()
+    if os.name == "posix" and os.getpgrp() == os.getpid():
+        os.killpg(os.getpid(), signal.SIGTERM)
+    os._exit(0)
