@@ -233,10 +233,10 @@ class KeptFunction:
             return None
         try:
             with waiting(), made_by_one(file, wait=True):
-                code, slot = self.find(file, arguments)
-                if code is None:
+                known, slot = self.find(file, arguments)
+                if known is None:
                     logger.info("compiling %s once; later runs find it on disk ...", self.function.__name__)
-                    code = self.make(slot, arguments)
+                code = known or self.make(slot, arguments)
         except Exception as error:  # of an experimental interface; torch.compile reports what is really wrong
             logger.info("%s is compiled without being kept (%s)", self.function.__name__, first_line(error))
             self.works = False
