@@ -57,7 +57,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins, keep_states: bool = 
     whose first steps may have followed other settings.
     """
     if not run.ranks.first:
-        follow(run, settings, plugins)
+        follow(run, plugins)
         return
     trackers = build_trackers(settings.trackers)
     remove_partial(cache_root())
@@ -149,7 +149,7 @@ def problems_logged(what: str) -> Iterator[None]:
         logger.warning("after this error %s could not be kept (%s)", what, first_line(problem))
 
 
-def follow(run: Run, settings: Settings, plugins: Plugins) -> None:
+def follow(run: Run, plugins: Plugins) -> None:
     """Trains as the first process does, and writes nothing."""
     warm(run, helped=False)
     with plugins.listening([Guard(), Agreement()]):
