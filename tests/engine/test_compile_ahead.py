@@ -36,7 +36,7 @@ def compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def files_of(calls: list[Call]) -> dict[Path, str]:
     """Returns where code for calls is kept, and the names of their functions."""
-    return {file_of(call): call[0].function.__name__ for call in calls}
+    return {file_of(*call): call[0].function.__name__ for call in calls}
 
 
 @pytest.mark.skipif(not available(), reason="no working compiler")

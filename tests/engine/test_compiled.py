@@ -107,7 +107,7 @@ def test_the_shipped_number_of_unrolled_splats(monkeypatch: pytest.MonkeyPatch) 
     assert errors.gradient <= 1e-4
     with recorded() as calls:
         render_with_gradients(splats, front_camera(), rules, depth=False)
-    loops = {call[0].function.__name__: file_of(call).read_bytes().count(b"#pragma omp for") for call in calls}
+    loops = {call[0].function.__name__: file_of(*call).read_bytes().count(b"#pragma omp for") for call in calls}
     assert loops["blend"] == 1
     assert loops["transmit"] <= 3  # a product, and twice its factor
     assert loops["gradients"] == 8  # slopes, two of sums, and five that lay columns out: more would talk through memory

@@ -1,4 +1,4 @@
-"""What a step frees is kept for the next, instead of being given back and asked for again page by page."""
+"""Memory that a step frees is kept for the next step, instead of being asked for again page by page."""
 
 import ctypes
 import os
@@ -6,7 +6,7 @@ import sys
 from contextlib import suppress
 
 TRIM_THRESHOLD, MMAP_MAX = -1, -4
-"""Names of glibc's options (malloc.h)."""
+"""glibc's options (malloc.h)."""
 MOST_KEPT = 1 << 30
 """Bytes of free memory at the end of the heap, beyond which they are given back."""
 CHOSEN = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_MAX_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
@@ -14,11 +14,10 @@ CHOSEN = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_MAX_", "MALLOC_MMAP_THRESHOLD_"
 
 
 def keep_freed_memory() -> None:
-    """Have glibc take large tensors from its heap as well, and keep up to MOST_KEPT bytes of what is freed at its end,
-    for the rest of this process.
+    """Lets glibc take large tensors from its heap, and keep up to MOST_KEPT bytes of what is freed at its end.
 
-    A training step frees and asks again for hundreds of MB; by default large blocks come from the kernel each time, and
-    each of their pages costs a fault. Nothing happens where the C library is another.
+    A step frees and asks again for hundreds of MB; by default each page of a large block costs a fault. Other C
+    libraries are left alone.
     """
     if not sys.platform.startswith("linux") or any(name in os.environ for name in CHOSEN):
         return

@@ -11,9 +11,9 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from filelock import lock_descriptor
 
@@ -144,14 +144,9 @@ def whole(file: Path) -> bool:
     if listed(file.parent, file.name).get(file.name) != fingerprint(content):
         logger.warning("%s is not as it was written: it is made again", file)
         return False
-    touch(file.parent)
-    return True
-
-
-def touch(entry: Path) -> None:
-    """Marks an entry as used now."""
     with suppress(OSError):
-        os.utime(entry / MANIFEST)
+        os.utime(file.parent / MANIFEST)
+    return True
 
 
 # -- locks -------------------------------------------------------------------------------------------------------------
@@ -186,32 +181,24 @@ def in_use() -> Iterator[None]:
 
     A killed process keeps nothing. Where nothing can be written or locked, nothing is kept.
     """
-    stream = use_lock()
-    try:
+    with ExitStack() as stack:
+        try:
+            folder = make_folder(cache_root() / IN_USE)
+            partial = folder / f".use.{own_mark()}-{secrets.token_hex(4)}.partial"
+            locked = partial.with_suffix(".lock")  # others look for that name alone, which it gets once it is locked
+            stack.callback(remove_files, partial, locked)
+            lock_descriptor(stack.enter_context(partial.open("w")).fileno(), blocking=False)
+            partial.replace(locked)
+        except (OSError, InputError) as error:
+            logger.info("other processes cannot know that this one uses the cache: %s", error)
         yield
-    finally:
-        if stream is not None:
-            stream.close()
-            with suppress(OSError):
-                Path(stream.name).with_suffix(".lock").unlink()
 
 
-def use_lock() -> IO[str] | None:
-    """Opens and locks a file in IN_USE; renames it to what others look for once it is locked."""
-    stream = None
-    try:
-        folder = make_folder(cache_root() / IN_USE)
-        stream = (folder / f".use.{own_mark()}-{secrets.token_hex(4)}.partial").open("w")
-        lock_descriptor(stream.fileno(), blocking=False)
-        os.replace(stream.name, Path(stream.name).with_suffix(".lock"))
-    except (OSError, InputError) as error:
-        logger.info("other processes cannot know that this one uses the cache: %s", error)
-        if stream is not None:
-            stream.close()
-            with suppress(OSError):
-                Path(stream.name).unlink()
-        return None
-    return stream
+def remove_files(*paths: Path) -> None:
+    """Removes files, as far as they are there and can be removed."""
+    for path in paths:
+        with suppress(OSError):
+            path.unlink()
 
 
 def used_since() -> float:

@@ -1,4 +1,4 @@
-"""Python's collector of reference cycles, where it costs and finds next to nothing."""
+"""Python's collector of reference cycles, paused where it costs time and finds next to nothing."""
 
 import gc
 import sys
@@ -8,8 +8,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def gc_paused() -> Iterator[None]:
-    """Without the collector: while a program starts nearly all that is made stays, a million objects of torch among
-    them, and would be walked through again and again."""
+    """Pauses the collector: while a program starts, nearly all objects stay, and each walk through them is wasted."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -21,11 +20,10 @@ def gc_paused() -> Iterator[None]:
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """`gc_paused` while a program imports torch and all else: its objects stay, and are never walked through
-    again, of which half comes where Python ends. Where torch is there already there are other objects, too, which are
-    to be collected: then nothing more.
+    """Pauses the collector while a program imports torch, and keeps it from walking through these objects ever again.
 
-    OpenImageIO must come later: its binding complains of objects that are still there in the end.
+    Half of such walks come where Python ends. Where torch is there already, other objects are to be collected: then
+    they are only paused. OpenImageIO must be imported later: its binding complains of objects left in the end.
     """
     first = "torch" not in sys.modules
     with gc_paused():

@@ -310,8 +310,7 @@ def without_gradient(value: Any) -> Any:
 
 
 def without_offset(value: Any) -> Any:
-    """Returns a tensor (or each of some) as a view from the start of its storage: else code reads the offset at every
-    call, for nothing."""
+    """Returns tensors as views from the start of their storage: else code reads the offset at every call."""
     if not isinstance(value, Tensor):
         return type(value)(map(without_offset, value)) if isinstance(value, list | tuple) else value
     whole = torch.empty_strided(value.shape, value.stride(), dtype=value.dtype, device=value.device)
@@ -377,24 +376,23 @@ def record(function: KeptFunction, arguments: Arguments) -> bool:
     return calls is not None
 
 
-def file_of(call: Call) -> Path | None:
+def file_of(function: KeptFunction, arguments: Arguments, gradients: bool) -> Path | None:
     """Returns where code for a call is kept; None where none is."""
-    function, arguments, gradients = call
     with torch.set_grad_enabled(gradients):
         return function.file(arguments)
 
 
 def lacking(calls: Sequence[Call]) -> list[Call]:
     """Returns the calls whose code is not kept yet."""
-    return [call for call in calls if (file := file_of(call)) is None or not file.exists()]
+    return [call for call in calls if (file := file_of(*call)) is None or not file.exists()]
 
 
 def make_ahead(calls: Sequence[Call], stopping: Callable[[], bool] = lambda: False) -> None:
     """Compiles and keeps code for calls that lack it, until `stopping`; skips what another process compiles."""
-    for call in calls:
+    for function, arguments, gradients in calls:
         if stopping():
             return
-        (function, arguments, gradients), file = call, file_of(call)
+        file = file_of(function, arguments, gradients)
         if file is None or file.exists():
             continue
         with made_by_one(file) as alone, torch.set_grad_enabled(gradients), suppress(Exception):  # its user reports it

@@ -1,4 +1,4 @@
-"""Pictures that are dear to make, kept in the cache between runs."""
+"""Images that are expensive to make, kept in the cache between runs."""
 
 import functools
 import logging
@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 
 def kept_image(path: Path) -> UInt8[Tensor, "C H W"] | None:
-    """A picture as `keep_image` left it; None if it is not there or damaged."""
+    """Reads an image as `keep_image` left it; None if it is missing or damaged."""
     if not whole(path):
         return None
     try:
@@ -26,7 +26,7 @@ def kept_image(path: Path) -> UInt8[Tensor, "C H W"] | None:
 
 
 def keep_image(path: Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, "C H W"]) -> None:
-    """Keep a picture as PNG; a cache that cannot be written is no error."""
+    """Keeps an image as PNG; a cache that cannot be written is no error."""
     try:
         make_folder(path.parent)
         write_image(path, image)
@@ -37,5 +37,5 @@ def keep_image(path: Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, "C H W"
 
 @functools.lru_cache(maxsize=16)
 def warn_once(problem: str) -> None:
-    """Say once what keeps pictures from being kept."""
+    """Warns once of what keeps images from being kept."""
     logger.warning("%s; pictures are made again next time", problem)

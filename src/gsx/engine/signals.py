@@ -7,5 +7,5 @@ STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR2", "SIGHU
 
 
 def handled_signals() -> list[signal.Signals]:
-    """Signals of STOPPING that end training; `nohup` has the terminal's end ignored, and it stays so."""
+    """Lists the signals of STOPPING that end training, without those that `nohup` has set to be ignored."""
     return [number for number in STOPPING if signal.getsignal(number) != signal.SIG_IGN]
