@@ -43,8 +43,8 @@ CHECKED = ("TENSOR_MATCH", "DUPLICATE_INPUT", "SHAPE_ENV")
 that vary. Other values are part of the lookup, and the code that the function calls is part of the file's name."""
 TRACING: dict[str, Any] = {"automatic_dynamic_shapes": False, "record_runtime_overhead": False}
 """How torch traces: without guesses from earlier compilations, and without marks for its profiler around each call."""
-ROOMS = ("core", "engine")
-"""Packages of gsx that hold what its compiled functions call."""
+ROOMS = ("core/data", "core/gaussians", "core/quality", "core/rasterizer", "engine")
+"""Packages of gsx that hold what its compiled functions call; import contracts keep them from the others."""
 IMPORTED = time.time()
 """Files that are newer may differ from the code that this process runs."""
 LIBRARY = re.compile(r"(/\S+\.so): ")
@@ -72,7 +72,7 @@ def place() -> Path | None:
 
 @functools.cache
 def sources_of(module: str) -> str | None:
-    """Digests the source that functions of a module run: gsx's core and engine, and the module's package elsewhere.
+    """Digests the source that functions of a module run: ROOMS of gsx, and the module's package elsewhere.
 
     None where the module is no file, or where a file was edited after this process imported it.
     """
@@ -155,10 +155,7 @@ def flat(arguments: Iterable[Any]) -> list[Tensor]:
 
 
 def load(file: Path, options: dict[str, Any]) -> Code | None:
-    """Loads what `save` wrote; None where there is nothing that this torch can load.
-
-    `options`: those of its compilation; with others torch would compile its C++ anew.
-    """
+    """Loads what `save` wrote; None where this torch can load nothing. Other `options` would compile its C++ anew."""
     from torch._inductor import config  # takes seconds to import
 
     try:
@@ -247,12 +244,13 @@ class KeptFunction:
     def file(self, arguments: Arguments) -> Path | None:
         """Returns where code for such arguments is kept; None where none is."""
         folder, sources = place(), sources_of(self.function.__module__)
-        if folder is None or sources is None or self.function.__closure__ or not self.works:
+        if not (folder and sources and self.works) or self.function.__closure__:
             return None
         varying = {(id(tensor), axis) for tensor, axis in self.varying(arguments)}
-        forms, last = [form_of(value, varying) for value in arguments], repr(self.function.__defaults__)
-        how = sorted(self.options.items()), self.checked, sorted(TRACING.items())
-        key = content_key(self.function.__qualname__, sources, last, how, forms, *modes(arguments), machine())
+        forms, function = [form_of(value, varying) for value in arguments], self.function
+        how = repr(function.__defaults__), sorted(self.options.items()), self.checked, sorted(TRACING.items())
+        about = function.__module__, function.__qualname__, sources, how, forms
+        key = content_key(about, *modes(arguments), machine())
         return folder / f"{self.function.__name__}-{key}.bin"
 
     def find(self, file: Path, arguments: Arguments) -> tuple[Code | None, Path]:
