@@ -221,3 +221,17 @@ def test_what_killed_processes_left_half_written_among_the_pictures_is_removed(r
     assert main([verb, str(run)]) == 0
     assert not left.exists()
     assert mine.exists(), "its process is at work"
+
+
+@pytest.mark.parametrize(
+    ("shape", "sound", "unsound"),
+    [
+        (str, ["", "a"], [1, None, ["a"]]),
+        ([str], [[], ["a", "b"]], ["a", [1], {}]),
+        ((is_number, is_number), [[1, 2.5]], [[1], [1, 2, 3], [1, "2"], None]),
+        ({"a": is_number, "b?": [str]}, [{"a": 1}, {"a": 1, "b": [], "c": None}], [{}, {"a": None}, {"a": 1, "b": 2}]),
+        ({str: {"a?": dict}}, [{}, {"x": {}, "y": {"a": {}}}], [[], {"x": {"a": 1}}, {"x": 1}]),
+    ],
+)
+def test_shapes_are_types_predicates_lists_tuples_and_mappings(shape: object, sound: list, unsound: list) -> None:
+    assert [fits(value, shape) for value in (*sound, *unsound)] == [True] * len(sound) + [False] * len(unsound)

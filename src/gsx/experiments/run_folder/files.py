@@ -162,7 +162,7 @@ def read_run(folder: Path) -> RunFiles:
     problems: dict[str, str] = {}
     config, text = read_yaml(folder / "config.yaml", problems)
 
-    def read(name: str, shape: dict[str, Any]) -> dict[str, Any]:
+    def read(name: str, shape: shapes.Shape) -> dict[str, Any]:
         return read_mapping(folder, name, problems, shape)
 
     evaluation = read("evaluation.json", shapes.EVALUATION)
@@ -200,7 +200,7 @@ def read_yaml(path: Path, problems: dict[str, str]) -> tuple[dict[str, Any], str
     return content, text
 
 
-def read_mapping(folder: Path, name: str, problems: dict[str, str], shape: dict[str, Any]) -> dict[str, Any]:
+def read_mapping(folder: Path, name: str, problems: dict[str, str], shape: shapes.Shape) -> dict[str, Any]:
     """Reads a JSON object; empty where the file is missing, damaged, or does not fit its shape."""
     try:
         content = read_json(folder / name)

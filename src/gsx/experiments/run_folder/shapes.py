@@ -12,39 +12,14 @@ def is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST <= value <= LARGEST
 
 
-def is_count(value: Any) -> bool:
+def is_length(value: Any) -> bool:
+    """Recognises a number above 0."""
+    return is_number(value) and value > 0
+
+
+def is_number_or_null(value: Any) -> bool:
     """Recognises a number or null."""
     return value is None or is_number(value)
-
-
-def is_text(value: Any) -> bool:
-    """Recognises a text."""
-    return isinstance(value, str)
-
-
-def is_list(value: Any) -> bool:
-    """Recognises a list of anything."""
-    return isinstance(value, list)
-
-
-def is_pair(value: Any) -> bool:
-    """Recognises a list of two values."""
-    return isinstance(value, list) and len(value) == 2
-
-
-def is_range(value: Any) -> bool:
-    """Recognises a list of two numbers."""
-    return is_pair(value) and all(map(is_number, value))
-
-
-def is_size(value: Any) -> bool:
-    """Recognises a width and a height above 0."""
-    return is_range(value) and min(value) > 0
-
-
-def is_window(value: Any) -> bool:
-    """Recognises the left, top, width and height of a window; the last two are above 0."""
-    return isinstance(value, list) and len(value) == 4 and all(map(is_number, value)) and min(value[2:]) > 0
 
 
 def is_decimal(word: str) -> bool:
@@ -60,58 +35,63 @@ def is_file_name(name: Any) -> bool:
     return isinstance(name, str) and Path(name).name not in ("", "..")
 
 
-Shape: TypeAlias = dict[Any, Any]
+Shape: TypeAlias = Any
+"""A type, a predicate, [shape of all entries], (shape of each entry), or {key: shape of its value}.
 
-PICTURES: Shape = {is_text: is_file_name}
-SHARES: Shape = {is_text: is_number}
+"key?" may be missing; a type or predicate as key stands for all keys.
+"""
+SIZE: Shape = (is_length, is_length)
+PICTURES: Shape = {str: is_file_name}
+SHARES: Shape = {str: is_number}
 COUNTS: Shape = {is_decimal: is_number}
-PSEUDO: Shape = {"asked": COUNTS, "dropped": COUNTS, "warned": {is_text: COUNTS}}
+PSEUDO: Shape = {"asked": COUNTS, "dropped": COUNTS, "warned": {str: COUNTS}}
 LINE: Shape = {
     "step": is_number,
-    "memory_mb?": is_count,
-    "withheld?": is_count,
-    "test_psnr?": is_count,
-    "pseudo?": {is_text: PSEUDO},
+    "memory_mb?": is_number_or_null,
+    "withheld?": is_number_or_null,
+    "test_psnr?": is_number_or_null,
+    "pseudo?": {str: PSEUDO},
 }
 """A line of metrics.jsonl, as far as a run that goes on reads it again."""
 EVALUATION: Shape = {
-    "step?": is_count,
-    "views?": [{"name?": is_text}],
-    "zoom?": {is_decimal: {}},
-    "groups?": {is_text: {}},
-    "protocol?": {"size?": is_size, "scene?": {}, "test_views?": is_list},
+    "step?": is_number_or_null,
+    "views?": [{"name?": str}],
+    "zoom?": {is_decimal: dict},
+    "groups?": {str: dict},
+    "protocol?": {"size?": SIZE, "scene?": dict, "test_views?": list},
     "withheld?": {"step": is_number},
-    "pseudo?": {is_text: {"dropped": SHARES, "warned?": {is_text: SHARES}}},
-    "left_out?": is_count,
-    "remarks?": [is_text],
+    "pseudo?": {str: {"dropped": SHARES, "warned?": {str: SHARES}}},
+    "left_out?": is_number_or_null,
+    "remarks?": [str],
 }
-ENVIRONMENT: Shape = {"scene?": {"notes?": is_list}, "history?": [{"changed?": {is_text: is_pair}}]}
+ENVIRONMENT: Shape = {"scene?": {"notes?": list}, "history?": [{"changed?": {str: (object, object)}}]}
 DRAWN: Shape = {
-    "views?": [{"size": is_size, "files?": PICTURES, "depth?": is_range}],
-    "zoom?": [{"factor": is_number, "window": is_window, "files?": PICTURES}],
-    "flight?": {"file": is_file_name, "size": is_size, "frames": is_number},
+    "views?": [{"size": SIZE, "files?": PICTURES, "depth?": (is_number, is_number)}],
+    "zoom?": [{"factor": is_number, "window": (is_number, is_number, *SIZE), "files?": PICTURES}],
+    "flight?": {"file": is_file_name, "size": SIZE, "frames": is_number},
 }
-PSEUDO_VIEWS: Shape = {"views?": [{}]}
-PHOTOGRAPHS: Shape = {"step?": is_count, "views": [{"name": is_text, "remarks": is_list, "files?": PICTURES}]}
-STATUS: Shape = {"step?": is_count}
-COMPACT: Shape = {"from": is_text}
+PSEUDO_VIEWS: Shape = {"views?": [dict]}
+PHOTOGRAPHS: Shape = {"step?": is_number_or_null, "views": [{"name": str, "remarks": list, "files?": PICTURES}]}
+STATUS: Shape = {"step?": is_number_or_null}
+COMPACT: Shape = {"from": str}
 
 
-def fits(value: Any, shape: Any) -> bool:
-    """Checks a value of JSON against a shape.
-
-    A shape is a predicate, [shape of all entries], or {key: shape}: "key?" may be missing, a predicate stands for all.
-    """
+def fits(value: Any, shape: Shape) -> bool:
+    """Checks a value of JSON against a shape."""
+    if isinstance(shape, type):
+        return isinstance(value, shape)
     if isinstance(shape, list):
         return isinstance(value, list) and all(fits(entry, shape[0]) for entry in value)
+    if isinstance(shape, tuple):
+        return isinstance(value, list) and len(value) == len(shape) and all(map(fits, value, shape))
     if isinstance(shape, dict):
         return isinstance(value, dict) and all(key_fits(value, key, inner) for key, inner in shape.items())
     return bool(shape(value))
 
 
-def key_fits(content: dict[str, Any], key: Any, shape: Any) -> bool:
+def key_fits(content: dict[str, Any], key: Shape, shape: Shape) -> bool:
     """Checks what a mapping has under a key of a shape."""
-    if callable(key):
-        return all(key(name) and fits(inner, shape) for name, inner in content.items())
+    if not isinstance(key, str):
+        return all(fits(name, key) and fits(inner, shape) for name, inner in content.items())
     name = key.removesuffix("?")
     return fits(content[name], shape) if name in content else key.endswith("?")
