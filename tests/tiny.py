@@ -133,7 +133,7 @@ class StopAfter:
     @hookimpl
     def gsx_step_finished(self, run: Run) -> None:
         """Ask the run to stop."""
-        run.stopping = run.step >= self.step
+        run.progress.stopping = run.step >= self.step
 
 
 class Raises:

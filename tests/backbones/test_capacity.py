@@ -28,7 +28,7 @@ from gsx.core.errors import ConfigError
 from gsx.core.rasterizer import rasterize
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.importance import Probe, Removal
-from gsx.core.training.photographs import Photographs
+from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.validation import decibels, part_of
 from gsx.experiments.reports.report import growth_chart
 from gsx.modules.bilateral_grid import RANK, apply_grid
@@ -129,7 +129,7 @@ def test_a_window_lies_where_it_is_told() -> None:
 
 
 def test_training_does_not_see_validation_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Photographs white in their windows train to the same bits, until the windows move."""
+    """PhotoCache white in their windows train to the same bits, until the windows move."""
     words = (
         *LIGHT,
         "scene.train_views=4",
@@ -139,16 +139,16 @@ def test_training_does_not_see_validation_windows(tmp_path: Path, monkeypatch: p
     )
     words = (*words, "backbone.capacity=adaptive", "backbone.density.stop=29000", "rasterizer=eager")
     plain = tiny_run(tmp_path / "plain", words, stop_after=9)
-    model, learnt_from = plain.backbone, Photographs.of
+    model, learnt_from = plain.backbone, PhotoCache.of
 
-    def disturbed(self: Photographs, view: View) -> Tensor:
+    def disturbed(self: PhotoCache, view: View) -> Tensor:
         out = learnt_from(self, view).clone()
         window = model.validation_window(view, 2)  # type: ignore[attr-defined]
         if window is not None:
             out[:, *window.pixels] = 1
         return out
 
-    monkeypatch.setattr(Photographs, "of", disturbed)
+    monkeypatch.setattr(PhotoCache, "of", disturbed)
     tiny_run(tmp_path / "white", words, stop_after=9)
     before, after = (load_file(tmp_path / name / "checkpoints/step_0000003.safetensors") for name in ("plain", "white"))
     assert before.keys() == after.keys()
@@ -524,7 +524,7 @@ def test_levels_are_judged_when_growth_ends(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 class RightHalf(Grey):
-    """Photographs that are transparent left of their middle; `all_of_it`: everywhere."""
+    """PhotoCache that are transparent left of their middle; `all_of_it`: everywhere."""
 
     all_of_it = False
 

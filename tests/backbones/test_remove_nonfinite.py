@@ -21,6 +21,7 @@ from gsx.core.rasterizer import RasterSettings, rasterize, touches
 from gsx.core.training.backbone import remove_nonfinite
 from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import named_parameters, table_tensors
+from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import backward, train_step
 from gsx.core.training.training_views import TrainingViews
@@ -36,14 +37,13 @@ def run_of(name: str, folder: Path) -> Run:
     return Run(
         config={},
         folder=folder,
-        scene=scene,
         backbone=backbone,
         raster=backbone.raster,
         training=TrainingOptions(
             ssim_weight=0.2, random_background=False, log_every=1, checkpoint_every=9, checkpoints_kept=1, test_points=0
         ),
         iterations=30,
-        device=torch.device("cpu"),
+        photos=PhotoCache(torch.device("cpu")),
         generator=torch.Generator().manual_seed(0),
         views=TrainingViews(scene=scene),
         sampler=Sampler(4, 0),

@@ -133,10 +133,10 @@ def moved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Path]:
 
 def test_a_run_finds_how_its_cameras_moved(moved: tuple[Run, Path]) -> None:
     run, _ = moved
-    told = [line for line in run.curves if "blur_seconds" in line]
+    told = [line for line in run.progress.curves if "blur_seconds" in line]
     assert [line["step"] for line in told] == run.modules["blur"].steps()
     module = run.modules["blur"]
-    remarks = " ".join(module.remarks(module.summary(run.curves)))
+    remarks = " ".join(module.remarks(module.summary(run.progress.curves)))
     assert f"moved in {len(module.movements)} training photos" in remarks
     size, far = torch.tensor([80.0, 64.0], dtype=torch.float64), 0
     for view in run.scene.train:
@@ -148,7 +148,7 @@ def test_a_run_finds_how_its_cameras_moved(moved: tuple[Run, Path]) -> None:
 
 def test_a_run_resumes_as_if_never_stopped_and_learns_by_what_was_found(tmp_path: Path) -> None:
     whole = tiny_run(tmp_path / "whole", SHORTER)
-    assert [line["step"] for line in whole.curves if "blur_seconds" in line] == [7, 9, 11]
+    assert [line["step"] for line in whole.progress.curves if "blur_seconds" in line] == [7, 9, 11]
     tiny_run(tmp_path / "stopped", SHORTER, stop_after=8)
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
     assert run.modules["blur"].movements
@@ -188,8 +188,8 @@ def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path
     words = ["training.blur.when=auto", "training.blur.sharpness=10", "training.blur.explained=0.5"]
     judged = tiny_run(tmp_path / "judged", [*SIZE, "iterations=6", *words])
     assert not plain.modules["blur"].active
-    assert [line["blurred"] for line in judged.curves if "blur_seconds" in line] == [0]
-    assert [line["blur_suspects"] for line in judged.curves if "blur_seconds" in line] == [6]
+    assert [line["blurred"] for line in judged.progress.curves if "blur_seconds" in line] == [0]
+    assert [line["blur_suspects"] for line in judged.progress.curves if "blur_seconds" in line] == [6]
     a, b = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "judged")
     assert a.keys() == b.keys()
     assert all(torch.equal(a[name], b[name]) for name in a)

@@ -173,7 +173,7 @@ def test_a_run_resumes_as_if_never_stopped_and_leaves_out_what_covers_its_photog
     assert a.keys() == b.keys()
     assert "distractors.0" in a
     assert all(torch.equal(a[name], b[name]) for name in a)
-    told = [line for line in whole.curves if "distractor_seconds" in line]
+    told = [line for line in whole.progress.curves if "distractor_seconds" in line]
     assert [line["step"] for line in told] == run.modules["distractors"].milestones()
     assert sum(line["forgotten"] for line in told) > 0
     found, covered, others = 0, 0, 0
@@ -224,7 +224,7 @@ def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path
     judged = tiny_run(tmp_path / "judged", [*short, *asked])
     assert not plain.modules["distractors"].active
     assert not judged.modules["distractors"].active
-    assert [line["distractors"] for line in judged.curves if "distractor_share" in line] == [0]
+    assert [line["distractors"] for line in judged.progress.curves if "distractor_share" in line] == [0]
     a, b = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "judged")
     assert a.keys() == b.keys()
     assert all(torch.equal(a[name], b[name]) for name in a)

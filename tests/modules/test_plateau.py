@@ -18,7 +18,7 @@ from gsx.core.data.camera import look_at
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
-from gsx.core.training.photographs import Photographs
+from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.pseudo_views import PseudoView, kept_out, pseudo_loss
 from gsx.core.training.run import Run
 from gsx.core.training.validation import rounding_in
@@ -143,7 +143,7 @@ def test_steps_that_gain_too_little_are_left_out(whole: tuple[Run, Path]) -> Non
     run, folder = whole
     assert steps_of(folder) == [*range(1, 17), *range(32, 41)]
     assert run.modules["plateau"].gains[:, 0].tolist() == [16]
-    assert run.curves[16]["steps_left_out"] == 15
+    assert run.progress.curves[16]["steps_left_out"] == 15
 
 
 @pytest.mark.parametrize(
@@ -184,9 +184,9 @@ def test_pseudo_details_whose_event_was_left_out_begin_late(tmp_path: Path, seen
     words = (*LEAVES_OUT, "augmenter=upscale", "regenerator/upscale=lanczos", *timing)
     run = tiny_run(tmp_path / "run", words)
     assert steps_of(tmp_path / "run") == [*range(1, 17), *range(32, 41)]
-    events = {line["step"]: line["pseudo"]["upscale"]["event"] for line in run.curves if "pseudo" in line}
+    events = {line["step"]: line["pseudo"]["upscale"]["event"] for line in run.progress.curves if "pseudo" in line}
     assert events == {32: 31, 37: 36}
-    assert all("upscale" in line["terms"] for line in run.curves if line["step"] >= 32)
+    assert all("upscale" in line["terms"] for line in run.progress.curves if line["step"] >= 32)
     late = [view for view in seen if view.provenance["event"] == 28]
     assert {view.provenance["made_after_step"] for view in late} == {31}
 
@@ -199,21 +199,21 @@ def test_every_step_is_taken_that_gains_enough(tmp_path: Path, monkeypatch: pyte
 
 
 def test_training_does_not_see_the_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Photographs white in them train to the same bits as long as they stay; where they are seen again, to others."""
-    words, photograph = (*WORDS, "training.plateau.price=1e-6"), Photographs.of
+    """PhotoCache white in them train to the same bits as long as they stay; where they are seen again, to others."""
+    words, photograph = (*WORDS, "training.plateau.price=1e-6"), PhotoCache.of
     plain = tiny_run(tmp_path / "plain", words, stop_after=16)
     own = {view.name: window for view, window in plain.modules["plateau"].windows(plain.scene.train, 10).items()}
     assert len(own) == 6
     taken = list[int]()
 
-    def disturbed(self: Photographs, view: View) -> Tensor:
+    def disturbed(self: PhotoCache, view: View) -> Tensor:
         taken.append(0)
         out = photograph(self, view).clone()
         if len(taken) > 10:
             out[:, *own[view.name].pixels] = 1
         return out
 
-    monkeypatch.setattr(Photographs, "of", disturbed)
+    monkeypatch.setattr(PhotoCache, "of", disturbed)
     tiny_run(tmp_path / "white", words, stop_after=16)
     taken.clear()
     tiny_run(tmp_path / "later", words, stop_after=18)

@@ -350,7 +350,7 @@ def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path
     judged = tiny_run(tmp_path / "judged", [*short, "training.poses.when=auto", "training.poses.spread=50"])
     assert not plain.modules["poses"].active
     assert not judged.modules["poses"].active
-    assert [line["poses"] for line in judged.curves if "pose_spread" in line] == [0]
+    assert [line["poses"] for line in judged.progress.curves if "pose_spread" in line] == [0]
     a, b = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "judged")
     assert a.keys() == b.keys()
     assert all(torch.equal(a[name], b[name]) for name in a)

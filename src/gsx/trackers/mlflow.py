@@ -158,7 +158,7 @@ class MLflow:
 
     def send(self, run: Run) -> None:
         """Sends the lines of metrics.jsonl that MLflow lacks."""
-        lines = [line for line in run.curves if line["step"] > self.sent_step]
+        lines = [line for line in run.progress.curves if line["step"] > self.sent_step]
         self.log([metric for line in lines for metric in metrics(line_figures(line), int(line["step"]))])
         self.sent_step = max([self.sent_step, *(int(line["step"]) for line in lines)])
         self.sent_at = time.monotonic()

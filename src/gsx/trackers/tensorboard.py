@@ -45,7 +45,7 @@ class TensorBoard:
         folder = events_folder(run, self.options.folder)
         resumed = any(folder.glob("events.out.tfevents.*"))
         self.writer = SummaryWriter(str(folder), purge_step=run.step + 1 if resumed else None)
-        self.sent = len(run.curves) if resumed else 0
+        self.sent = len(run.progress.curves) if resumed else 0
         self.writer.add_text("config", indented((run.folder / "config.yaml").read_text(encoding="utf-8")), run.step)
         self.send(run)
 
@@ -81,11 +81,11 @@ class TensorBoard:
 
     def send(self, run: Run) -> None:
         """Writes new lines to the disk at once: what a checkpoint covers must be there when a run goes on."""
-        lines = run.curves[self.sent :]
+        lines = run.progress.curves[self.sent :]
         for line in lines:
             for tag, value in line_figures(line).items():
                 self.writer.add_scalar(tag, value, int(line["step"]))
-        self.sent = len(run.curves)
+        self.sent = len(run.progress.curves)
         if lines:
             self.writer.flush()
 

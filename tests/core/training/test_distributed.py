@@ -25,6 +25,7 @@ from gsx.core.plugins import load_plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.distributed import Ranks, ranks_here
 from gsx.core.training.guard import Agreement
+from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import train_step
 from gsx.core.training.training_views import TrainingViews
@@ -306,12 +307,11 @@ def test_ranks_that_disagree_are_stopped_where_checkpoints_are_due(tmp_path: Pat
     run = Run(
         config={},
         folder=tmp_path,
-        scene=scene,
         backbone=small_gs3d(scene),
         raster=RasterSettings(),
         training=replace(TRAINING, checkpoint_every=3),
         iterations=7,
-        device=torch.device("cpu"),
+        photos=PhotoCache(torch.device("cpu")),
         generator=torch.Generator(),
         views=TrainingViews(scene=scene),
         sampler=Sampler(4, 0),

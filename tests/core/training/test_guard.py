@@ -18,6 +18,7 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import gradients, keep_rows, table_tensors
+from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.run import Run, Sampler, StepResult, TrainingOptions
 from gsx.core.training.trainer import train, train_step
 from gsx.core.training.training_views import TrainingViews
@@ -51,14 +52,13 @@ def run_with(poison: dict[int, str], folder: Path, iterations: int = 8, points: 
     return Run(
         config={},
         folder=folder,
-        scene=scene,
         backbone=backbone,
         raster=RasterSettings(),
         training=TrainingOptions(
             ssim_weight=0.2, random_background=False, log_every=1, checkpoint_every=9, checkpoints_kept=1, test_points=0
         ),
         iterations=iterations,
-        device=torch.device("cpu"),
+        photos=PhotoCache(torch.device("cpu")),
         generator=generator,
         views=TrainingViews(scene=scene),
         sampler=Sampler(4, 0),

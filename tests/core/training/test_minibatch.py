@@ -366,7 +366,7 @@ def final(folder: Path) -> dict[str, Tensor]:
 
 def test_a_resumed_run_of_batches_equals_one_that_never_stopped(tmp_path: Path) -> None:
     whole = tiny_run(tmp_path / "whole", DENSE)
-    grown = [line["step"] for line in whole.curves if "cloned" in line]
+    grown = [line["step"] for line in whole.progress.curves if "cloned" in line]
     assert grown == [6, 12], "the test needs density events before and after the stop"
     stopped_at(tmp_path / "run", DENSE, 8)
     assert_same(final(tmp_path / "run"), final(tmp_path / "whole"))

@@ -49,4 +49,4 @@ def test_waiting_for_code_is_no_training(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
     monkeypatch.setattr(trainer, "train_step", step)
     trainer.train(run, plugins(), training_clock)
-    assert (run.step, run.seconds) == (3, 6.0)
+    assert (run.step, run.progress.seconds) == (3, 6.0)

@@ -19,6 +19,7 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
+from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.evaluation.eval_options import EvalOptions
@@ -90,12 +91,11 @@ def run_of(folder: Path, photograph: type[Grey] = Grey) -> Run:
     return Run(
         config={},
         folder=folder,
-        scene=scene,
         backbone=backbone,
         raster=RasterSettings(cull="tight"),
         training=training,
         iterations=7,
-        device=torch.device("cpu"),
+        photos=PhotoCache(torch.device("cpu")),
         generator=torch.Generator(),
         views=TrainingViews(scene=scene),
         sampler=Sampler(3, 0),

@@ -22,6 +22,7 @@ from gsx.core.quality.metrics import bicubic, psnr, quantise, ssim
 from gsx.core.rasterizer import RasterSettings, Rendering, TiledRendering
 from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.parameter_table import ParameterTable
+from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.training_views import TrainingViews
@@ -118,12 +119,11 @@ def make_run(folder: Path, views: int = 3, finest: float = math.inf) -> Run:
     return Run(
         config={},
         folder=folder,
-        scene=scene,
         backbone=FourSplats(),
         raster=RasterSettings(),
         training=training,
         iterations=10,
-        device=torch.device("cpu"),
+        photos=PhotoCache(torch.device("cpu")),
         generator=generator,
         views=TrainingViews(scene=scene),
         sampler=Sampler(views, 0),

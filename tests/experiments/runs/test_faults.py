@@ -161,7 +161,7 @@ def test_a_run_that_is_asked_to_stop_leaves_an_event_at_once(tmp_path: Path, mon
 
     def stopping(self: Redrawer, run: Run, event: int, spec: Any) -> Any:
         asked.append(spec.kind)
-        run.stopping = len(asked) == 2
+        run.progress.stopping = len(asked) == 2
         return request(self, run, event, spec)
 
     with monkeypatch.context() as patch:
@@ -181,7 +181,7 @@ def test_a_batch_is_left_between_its_views(tmp_path: Path, monkeypatch: pytest.M
 
     def stopping(run: Run, *given: Any) -> Any:
         seen.append(run.step)
-        run.stopping = len(seen) == 8  # the second view of the third step
+        run.progress.stopping = len(seen) == 8  # the second view of the third step
         return view_loss(run, *given)
 
     with monkeypatch.context() as patch:

@@ -21,6 +21,7 @@ from gsx.core.plugins import load_plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.parameter_table import table_tensors
+from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.run import Run, Sampler, TrainingOptions
 from gsx.core.training.trainer import train_step
 from gsx.core.training.training_views import TrainingViews
@@ -72,12 +73,11 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
     run = Run(
         config={},
         folder=folder,
-        scene=scene,
         backbone=anew(scene, 40, generator, resolution),
         raster=RasterSettings(),
         training=TRAINING,
         iterations=40,
-        device=torch.device("cpu"),
+        photos=PhotoCache(torch.device("cpu")),
         generator=generator,
         views=resolution,
         sampler=Sampler(views, 0),
@@ -123,10 +123,10 @@ def state_of(run: Run) -> list[Tensor]:
 def test_the_run_goes_on_as_if_nothing_had_been(tmp_path: Path) -> None:
     run, _, held_out = begun(tmp_path)
     run.training = replace(TRAINING, random_background=True)
-    before, seconds = state_of(run), run.seconds
+    before, seconds = state_of(run), run.progress.seconds
     held_out(0.5, 3)
     assert all(torch.equal(a, b) for a, b in zip(before, state_of(run), strict=True))
-    assert (run.step, run.seconds) == (20, seconds)
+    assert (run.step, run.progress.seconds) == (20, seconds)
     undisturbed, *_ = begun(tmp_path)
     undisturbed.training = run.training
     for each in (run, undisturbed):

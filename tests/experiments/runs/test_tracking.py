@@ -60,7 +60,7 @@ class Heard:
     def gsx_step_finished(self, run: Run) -> None:
         if run.step == self.options.fails_at:
             raise OSError("the disk is full")
-        self.events.append(f"step {run.step} of {len(run.curves)}")
+        self.events.append(f"step {run.step} of {len(run.progress.curves)}")
 
     @hookimpl
     def gsx_gradients_ready(self) -> str:
@@ -226,7 +226,7 @@ def tracked(tmp_path_factory: pytest.TempPathFactory) -> Tracked:
 def test_a_run_with_trackers_ends_in_the_same_bits(tmp_path: Path, tracked: Tracked) -> None:
     folder, _ = tracked
     run = tiny_run(tmp_path / "without", DENSE)
-    assert any("split" in line for line in run.curves)
+    assert any("split" in line for line in run.progress.curves)
     without, with_trackers = final_tensors(tmp_path / "without"), final_tensors(folder / "run")
     assert without.keys() == with_trackers.keys()
     assert all(torch.equal(without[name], with_trackers[name]) for name in without)

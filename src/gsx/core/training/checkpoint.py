@@ -52,7 +52,7 @@ def write(run: Run, folder: Path) -> Path:
     sidecar = {
         "schema": SCHEMA,
         "step": run.step,
-        "seconds": run.seconds,
+        "seconds": run.progress.seconds,
         "sampler": run.sampler.order,
         "orders": run.sampler.begun,
         "views": names_of(run),
@@ -192,7 +192,7 @@ def restore(run: Run, training: bool = False) -> None:
     for prefix, module in run.modules.items():
         module.load_state_dict(taken_out(tensors, f"{prefix}."))
     run.backbone.table = restored_table(run.backbone.table, tensors)
-    run.step, run.seconds = int(meta["step"]), float(meta["seconds"])
+    run.step, run.progress.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])
     run.sampler.begun = meta.get("orders", -(-run.step // run.sampler.count))  # gsx before orders were counted
     for sidecar in damaged if training and run.ranks.first else ():

@@ -20,7 +20,7 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, Observation
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.module import Modules
-from gsx.core.training.photographs import Photographs
+from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.pseudo_views import Term
 from gsx.core.training.training_views import TrainingViews
 
@@ -109,41 +109,62 @@ class Augmenter(Protocol):
 
 
 @dataclass(eq=False, kw_only=True)
+class Progress:
+    """How far a run is."""
+
+    step: int = 0
+    """Steps done."""
+    seconds: float = 0.0
+    """Time of training steps, without evaluation, files and waiting for code to be compiled."""
+    stopping: bool = False
+    """Whether to end after the current step, or within it where that takes long (`Run.refuse_if_stopping`)."""
+    changing: bool = False
+    """Whether a step is being applied: parameters and statistics are neither those before it nor those after it."""
+    curves: list[dict[str, float]] = field(default_factory=list)
+    """Lines of metrics.jsonl so far."""
+
+
+@dataclass(eq=False, kw_only=True)
 class Run:
     """State of one training. What must survive an interruption is in `checkpoint.py`."""
 
     config: dict[str, Any]
     """The composed configuration, resolved, JSON-serialisable."""
     folder: Path
-    scene: Scene
     backbone: Backbone[Any]
     raster: RasterSettings
     training: TrainingOptions
     views: TrainingViews
     iterations: int
-    device: torch.device
+    photos: PhotoCache
+    """Photos on the run's device."""
     generator: torch.Generator
     sampler: Sampler
     augmenters: Mapping[str, Augmenter] = field(default_factory=dict)
     """By name, in the order of their terms."""
     ranks: Ranks = Ranks()
     """The processes that train it together."""
-    step: int = 0
-    """Steps done."""
-    seconds: float = 0.0
-    """Time spent in training steps, without evaluation, files and waiting for code to be compiled."""
-    stopping: bool = False
-    """Set to end after the current step, or within it where that takes long (`refuse_if_stopping`)."""
-    changing: bool = False
-    """A step is being applied: parameters and statistics are neither those before it nor those after it."""
-    curves: list[dict[str, float]] = field(default_factory=list)
-    """Lines of metrics.jsonl so far."""
-    photograph_bytes: int = 0
-    """How many bytes photographs may take on the device (`core.training.photographs`)."""
-    photographs: Photographs = field(init=False)
+    progress: Progress = field(default_factory=Progress)
+    """What changes from step to step, beside the model."""
 
-    def __post_init__(self) -> None:
-        self.photographs = Photographs(self.device, self.photograph_bytes)
+    @property
+    def step(self) -> int:
+        """Steps done."""
+        return self.progress.step
+
+    @step.setter
+    def step(self, step: int) -> None:
+        self.progress.step = step
+
+    @property
+    def scene(self) -> Scene:
+        """The scene that the run trains on."""
+        return self.views.scene
+
+    @property
+    def device(self) -> torch.device:
+        """Where the run computes."""
+        return self.photos.device
 
     @property
     def modules(self) -> Modules:
@@ -174,7 +195,7 @@ class Run:
         Raises:
             Stopped: the run was asked to stop; not where other processes would wait for this one.
         """
-        if self.stopping and self.ranks.size == 1:
+        if self.progress.stopping and self.ranks.size == 1:
             raise Stopped(f"step {self.step + 1} was given up: the run was asked to stop")
 
     @property

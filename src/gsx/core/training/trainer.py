@@ -35,15 +35,15 @@ def train(run: Run, plugins: Plugins, clock: Callable[[], float] = time.perf_cou
     `clock`: seconds that count as training time.
     """
     plugins.emit.gsx_run_started(run=run)
-    while not (run.complete or any(run.ranks.all_gather(run.stopping))):
+    while not (run.complete or any(run.ranks.all_gather(run.progress.stopping))):
         start = clock()
         try:
             step = train_step(run, plugins)
         except Stopped:
             break
-        run.seconds += clock() - start
+        run.progress.seconds += clock() - start
         plugins.emit.gsx_step_finished(run=run, step=step)
-    run.photographs.see(())
+    run.photos.see(())
     plugins.emit.gsx_training_finished(run=run)
 
 
@@ -54,7 +54,7 @@ def train_step(run: Run, plugins: Plugins) -> StepResult:
         step = backward(run)
         step.changes.update(metrics)
         reason = veto(run, step, plugins)
-    run.changing = True
+    run.progress.changing = True
     if reason:
         zero_grad(run.backbone.table)
     else:
@@ -65,7 +65,7 @@ def train_step(run: Run, plugins: Plugins) -> StepResult:
         run.backbone.update(step.number)
         for module in run.modules.values():
             module.optimizer_step(step.number)
-    run.step, run.changing = step.number, False
+    run.step, run.progress.changing = step.number, False
     return step if not reason else replace(step, skipped=reason)
 
 
@@ -91,7 +91,7 @@ def remove_lost(run: Run, step: StepResult) -> str:
     cameras = [views[number].camera for number in run.sampler.taken]
     removed = remove_nonfinite(run.backbone, cameras, step.number)
     if removed:
-        run.changing = True
+        run.progress.changing = True
         logger.warning(
             "step %d: removed %d primitives with values that are not finite or cannot be drawn", step.number, removed
         )
@@ -108,7 +108,7 @@ def backward(run: Run) -> StepResult:
     views, steps = run.views.at(number), []
     for module in run.modules.values():
         module.zero_grad()
-    run.photographs.see(views)
+    run.photos.see(views)
     for view, of_view, colour in zip(picked, terms, colours, strict=True):
         run.refuse_if_stopping()
         with gradients_added(run.backbone.table):
@@ -126,7 +126,7 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     """
     windows, seen = withheld_windows(run, view, number), list[Observation]()
     counted = counted_in_loss(view, windows)
-    target = blacked(run.photographs.of(view), counted)
+    target = blacked(run.photos.of(view), counted)
     allowed = [without_windows(term, view.camera, windows) for term in terms]
     divided = [reusable_parts(term, view.camera, run.training.random_background) for term in allowed]
     parts = backward_terms(run, [term for term, _ in divided], number, seen)
@@ -134,7 +134,7 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     drawn, rendering = render_for_training(run, view.camera, number, colour)
     compiled = goes_compiled(run.raster, run.device.type)
     shown = run.views.match_photo(rendering.image, target, view, learning=True)
-    moments = run.photographs.moments_of(view, target, compiled) if counted is None else None
+    moments = run.photos.moments_of(view, target, compiled) if counted is None else None
     loss = photometric(blacked(shown, counted), target, run.training.ssim_weight, compiled, moments)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:

@@ -349,11 +349,12 @@ def learn_on(run: Run, views: Sequence[View], degree: int, steps: int, plugins: 
 @contextmanager
 def extended(run: Run, views: Sequence[View], steps: int) -> Iterator[None]:
     """The run as one that ends so many steps later, with these training views; afterwards nothing has been counted."""
-    names = ("step", "iterations", "seconds", "scene", "sampler", "training", "views")
+    names = ("progress", "iterations", "sampler", "training", "views")
     before = {name: getattr(run, name) for name in names}
-    run.scene, run.sampler = replace(run.scene, train=list(views)), Sampler(len(views), 0, batch=run.training.batch)
+    run.progress, scene = replace(run.progress), replace(run.scene, train=list(views))
+    run.sampler = Sampler(len(views), 0, batch=run.training.batch)
     run.iterations = run.step + steps
-    run.views = replace(run.views, scene=run.scene, modules=modules_for(run, views))
+    run.views = replace(run.views, scene=scene, modules=modules_for(run, views))
     run.training = replace(run.training, cooldown=steps / run.iterations)
     try:
         yield

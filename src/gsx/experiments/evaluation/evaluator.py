@@ -235,7 +235,7 @@ class Evaluator:
         if self.options.right_halves:
             for view in self.run.scene.test:
                 self.renders.evaluated_pixels(view, view.counted())
-        run, views = self.run, self.views(advance)
+        run, views, curves = self.run, self.views(advance), self.run.progress.curves
         primitives, size = size_of(run.backbone.table)
         groups = sorted({v["group"] for v in views if v["group"]})
         by_group = {name: [v for v in views if v["group"] == name] for name in groups}
@@ -249,13 +249,15 @@ class Evaluator:
             "primitives": primitives,
             "visible_primitives": mean([v["visible"] for v in views]),
             "left_out": mean([v["left_out"] for v in views]),
-            **gathered(run.curves),
+            **gathered(curves),
             **module_summaries(run),
             "megabytes": size / 1e6,
             "render_fps": self.frames_per_second(),
             "render_path": path_of(run.raster, run.device),
-            "train_seconds": run.seconds,
-            "peak_memory_mb": highest([peak_memory_mb(run.device), *(line.get("memory_mb") for line in run.curves)]),
+            "train_seconds": run.progress.seconds,
+            "peak_memory_mb": highest(
+                [peak_memory_mb(run.device), *(line.get("memory_mb") for line in run.progress.curves)]
+            ),
             "groups": {name: group_figures(vs) for name, vs in by_group.items()},
             "zoom": self.zooms(views, drawing, advance),
             "views": [{key: v[key] for key in ("name", "group", *figures)} for v in views],

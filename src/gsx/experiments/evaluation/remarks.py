@@ -29,7 +29,7 @@ class CapNotice:
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
         """A resumed run has said it."""
-        self.said = any(line.get("withheld") for line in run.curves)
+        self.said = any(line.get("withheld") for line in run.progress.curves)
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
@@ -62,7 +62,7 @@ def module_summaries(run: Run) -> dict[str, Any]:
     """Returns the figures of the run's modules, by their own keys."""
     figures: dict[str, Any] = {}
     for module in run.modules.values():
-        figures |= module.summary(run.curves)
+        figures |= module.summary(run.progress.curves)
     return figures
 
 

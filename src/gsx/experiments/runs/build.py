@@ -19,7 +19,7 @@ from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
 from gsx.core.training.distributed import Ranks, ranks_here
 from gsx.core.training.module import ModuleContext, Modules
-from gsx.core.training.photographs import room_for_photographs
+from gsx.core.training.photo_cache import PhotoCache, room_for_photos
 from gsx.core.training.regenerator import Regenerator
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.training_views import TrainingViews
@@ -184,16 +184,14 @@ def build(
     return Run(
         config=settings.resolved,
         folder=folder,
-        scene=scene,
         backbone=backbone,
         raster=backbone.raster,
         training=settings.training,
         views=views,
         iterations=general.iterations,
-        device=device,
+        photos=PhotoCache(device, room_for_photos(device) if training else 0),
         generator=generator,
         sampler=Sampler(len(scene.train), general.seed, batch=settings.training.batch),
-        photograph_bytes=room_for_photographs(device) if training else 0,
         augmenters=build_augmenters(settings, scene, anew) if training else {},
         ranks=ranks,
     )

@@ -134,7 +134,7 @@ def save_on_failure(run: Run, error: BaseException) -> None:
     kept = run.step in map(checkpoint.step_of, checkpoint.sidecars(run.folder / "checkpoints"))
     nothing = run.step == 0 and not isinstance(error, KeyboardInterrupt | CompilerError)  # who says how to go on
     with problems_logged(f"the checkpoint of step {run.step}"):
-        if not (kept or nothing or run.changing or isinstance(error, LostModel)):
+        if not (kept or nothing or run.progress.changing or isinstance(error, LostModel)):
             checkpoint.save(run)
     with problems_logged("its status"):
         status(run, "failed", reason_of(error))

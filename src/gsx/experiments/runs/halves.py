@@ -23,6 +23,7 @@ from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
 from gsx.core.training.backbone import Backbone
 from gsx.core.training.guard import Guard
+from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, Sampler
 from gsx.core.training.trainer import train_step
@@ -82,13 +83,12 @@ def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
     return Run(
         config=run.config,
         folder=run.folder,
-        scene=scene,
         backbone=backbone,
         raster=backbone.raster,
         training=run.training,
         views=training_views,
         iterations=steps,
-        device=run.device,
+        photos=PhotoCache(run.device),
         generator=generator,
         sampler=Sampler(len(views), own, batch=run.training.batch),
     )

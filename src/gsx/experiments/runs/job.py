@@ -42,7 +42,7 @@ def interruptible(run: "Run", onwards: str) -> Iterator[object]:
     received: list[int] = []
 
     def stop(number: int, frame: Any) -> None:
-        run.stopping = True
+        run.progress.stopping = True
         received.append(number)
         give_back(signal.SIGINT)
 

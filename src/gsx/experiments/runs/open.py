@@ -122,7 +122,7 @@ def begun(run: Run, settings: Settings, plugins: Plugins, claims: ExitStack | No
         write_json(run.folder / "environment.json", facts)
         if settings.general.init == "warm_start":
             warm_start.adopt(run, warm_start.warm_start_folder(run, settings.idle, plugins.versions))
-            run.curves = read_curves(run.folder)
+            run.progress.curves = read_curves(run.folder)
     except OSError:
         shutil.rmtree(run.folder, ignore_errors=True)
         raise
@@ -197,8 +197,8 @@ def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     focal = read_run(folder).environment.get("training_focal")
     if run.raster.training_focal and is_number(focal):  # the scene may be looked at in another size
         run.raster = run.backbone.raster = replace(run.raster, training_focal=float(focal))
-    run.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
-    recall_accounts(run.augmenters, run.curves)
+    run.progress.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
+    recall_accounts(run.augmenters, run.progress.curves)
     return run
 
 

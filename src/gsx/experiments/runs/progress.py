@@ -100,7 +100,7 @@ class Progress:
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
         """Measures speed from here on."""
-        self.shown = run.seconds
+        self.shown = run.progress.seconds
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
@@ -110,8 +110,8 @@ class Progress:
             return
         self.average("loss", float(step.loss))
         self.average("psnr", step.psnr())
-        self.average("speed", self.steps / max(run.seconds - self.shown, 1e-9))
-        self.steps, self.shown = 0, run.seconds
+        self.average("speed", self.steps / max(run.progress.seconds - self.shown, 1e-9))
+        self.steps, self.shown = 0, run.progress.seconds
         self.output.show(self.line(run))
 
     @hookimpl
@@ -151,8 +151,8 @@ class MetricsLog:
     def gsx_run_started(self, run: Run) -> None:
         """Opens the file; a resumed run drops lines later than its checkpoint."""
         path = run.folder / METRICS
-        run.curves[:] = [line for line in read_curves(run.folder) if line["step"] <= run.step]
-        replace_file(path, "".join(json.dumps(line) + "\n" for line in run.curves).encode())
+        run.progress.curves[:] = [line for line in read_curves(run.folder) if line["step"] <= run.step]
+        replace_file(path, "".join(json.dumps(line) + "\n" for line in run.progress.curves).encode())
         self.stream = path.open("a")
 
     @hookimpl
@@ -166,7 +166,7 @@ class MetricsLog:
         line = self.entry(run, step)
         if tested and run.scene.test:
             line["test_psnr"] = quick_psnr(run, self.options)
-        run.curves.append(line)
+        run.progress.curves.append(line)
         assert self.stream is not None
         self.stream.write(json.dumps(line) + "\n")
         self.stream.flush()
@@ -176,7 +176,7 @@ class MetricsLog:
         memory = peak_memory_mb(run.device)
         line = {
             "step": run.step,
-            "seconds": round(run.seconds, 3),
+            "seconds": round(run.progress.seconds, 3),
             "loss": float(step.loss),
             "psnr": step.psnr(),
             "primitives": len(run.backbone.table),

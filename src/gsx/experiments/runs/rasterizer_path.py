@@ -39,8 +39,8 @@ def warm(run: Run, helped: bool = True) -> None:
     backbone = run.backbone
     degree = backbone.sh_degree if isinstance(backbone, WithHarmonics) else 0
     step = Step(settings=run.raster, sh_degree=degree, absolute_gradient=backbone.absolute_gradient)
-    seconds = compile_ahead(step, run.device, helped, lambda: run.stopping)
-    if not run.stopping:
+    seconds = compile_ahead(step, run.device, helped, lambda: run.progress.stopping)
+    if not run.progress.stopping:
         logger.info("compiled in %.0f s", seconds)
 
 

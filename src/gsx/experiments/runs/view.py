@@ -46,7 +46,7 @@ class Watched:
             checkpoint.restore(self.run)
         except (CheckpointError, OSError):  # it may be half written, or gone already: the next look finds out
             return False
-        self.run.curves = read_curves(self.run.folder)
+        self.run.progress.curves = read_curves(self.run.folder)
         return True
 
     def faster(self, raster: RasterSettings) -> None:

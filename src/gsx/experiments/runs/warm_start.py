@@ -94,8 +94,10 @@ def branch(run: Run, sidecar: Path) -> None:
     replace_text(run.folder / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
     replace_file(own / sidecar.name, sidecar.read_bytes())  # last: without it a checkpoint does not exist
     checkpoint.restore(run, training=True)
-    write_json(run.folder / BRANCH, {"step": run.step, "seconds": run.seconds})
-    logger.info("init=warm_start: branching at step %d from an earlier run, %.0f s saved", run.step, run.seconds)
+    write_json(run.folder / BRANCH, {"step": run.step, "seconds": run.progress.seconds})
+    logger.info(
+        "init=warm_start: branching at step %d from an earlier run, %.0f s saved", run.step, run.progress.seconds
+    )
 
 
 def lines_at(sidecar: Path) -> Path:
@@ -128,7 +130,7 @@ class WarmStartKeeper:
         if kept and whole(lines_at(kept[0])):
             return
         lines = lines_at(folder / f"step_{run.step:07d}.json")
-        write_json(lines, {"lines": run.curves})
+        write_json(lines, {"lines": run.progress.curves})
         enlist(lines)
         checkpoint.write(run, folder)  # its sidecar has the digest of its tensors
         trim(self.gigabytes)

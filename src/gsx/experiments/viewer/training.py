@@ -28,7 +28,7 @@ class TrainingViewer:
             pass
         self.credit -= frames.spent - spent
         if viewer.paused:
-            viewer.serve(until=lambda: not viewer.pausing() or run.stopping)
+            viewer.serve(until=lambda: not viewer.pausing() or run.progress.stopping)
         self.before = time.monotonic()
 
     def stop(self) -> None:
@@ -38,6 +38,6 @@ class TrainingViewer:
 
 def told_of(run: Run) -> str:
     """How a run stands, in words."""
-    psnr = next((line["test_psnr"] for line in reversed(run.curves) if "test_psnr" in line), None)
+    psnr = next((line["test_psnr"] for line in reversed(run.progress.curves) if "test_psnr" in line), None)
     held_out = f", held-out PSNR {psnr:.2f} dB" if psnr is not None else ""
     return f"step {run.step:,} of {run.iterations:,}, {len(run.backbone.table):,} primitives{held_out}"

@@ -1,4 +1,4 @@
-"""Photographs where a run computes: decoded once while there is room, gone when others are trained on."""
+"""PhotoCache where a run computes: decoded once while there is room, gone when others are trained on."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,8 +11,8 @@ from torch import Tensor
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import View
 from gsx.core.quality.losses import moments_of
-from gsx.core.training import photographs as module
-from gsx.core.training.photographs import Photographs
+from gsx.core.training import photo_cache as module
+from gsx.core.training.photo_cache import PhotoCache
 
 CAMERA = look_at((0, 0, 0), (1, 0, 0), fov_x=1, width=8, height=4)
 BYTES = 3 * 8 * 4
@@ -35,7 +35,7 @@ class Counted:
 def test_what_has_room_is_decoded_once_and_makes_room_for_others() -> None:
     first, second, coarse = sources = [Counted(51), Counted(102), Counted(255)]
     views = [View(str(number), CAMERA, source) for number, source in enumerate(sources)]
-    photographs = Photographs(torch.device("cpu"), room=BYTES)
+    photographs = PhotoCache(torch.device("cpu"), room=BYTES)
     photographs.see(views[:2])
     for _ in range(2):
         assert torch.equal(photographs.of(views[0]), torch.full((3, 4, 8), 51.0) / 255)
@@ -52,7 +52,7 @@ def test_what_ssim_takes_of_a_photograph_is_found_once_while_there_is_room(monke
     views = [View(str(number), CAMERA, Counted(51 * number)) for number in range(3)]
     pictures = [view.image() for view in views]
     monkeypatch.setattr(module, "MOMENT_BYTES", 2 * 2 * 4 * BYTES + 1)  # two of each four-byte number of two pictures
-    photographs = Photographs(torch.device("cpu"), room=0)
+    photographs = PhotoCache(torch.device("cpu"), room=0)
     photographs.see(views)
     first = [
         photographs.moments_of(view, picture, compiled=False) for view, picture in zip(views, pictures, strict=True)
@@ -75,15 +75,15 @@ def test_training_is_the_same_whether_there_is_room_or_not(
     """Also where views change on the way."""
     most = []
 
-    def see(self: Photographs, views: Sequence[View]) -> None:
+    def see(self: PhotoCache, views: Sequence[View]) -> None:
         most.append(len(self.moments))
         plain(self, views)
 
-    plain = Photographs.see
-    monkeypatch.setattr(Photographs, "see", see)
+    plain = PhotoCache.see
+    monkeypatch.setattr(PhotoCache, "see", see)
     run = tiny_run(tmp_path / "kept", ["iterations=12", *words])
     assert max(most) >= 4  # of six
-    assert not run.photographs.moments
+    assert not run.photos.moments
     monkeypatch.setattr(module, "MOMENT_BYTES", 0)
     most.clear()
     tiny_run(tmp_path / "found_anew", ["iterations=12", *words])

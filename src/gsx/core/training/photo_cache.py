@@ -1,5 +1,4 @@
-"""Photographs where a run computes: bytes on the device, as long as there is room, made into numbers there; on a CPU
-also what the loss takes of them alone."""
+"""Photos where a run computes: bytes on the device, as long as there is room; on a CPU also their SSIM moments."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,42 +11,42 @@ from gsx.core.device import uploaded
 from gsx.core.quality.losses import moments_of
 from gsx.core.shapes import Float, UInt8
 
-SHARE = 0.25
-"""Of a GPU's free memory, at most, that photographs take."""
+GPU_SHARE = 0.25
+"""Largest share of a GPU's free memory that photos take."""
 MOMENT_BYTES = 1 << 29
-"""That SSIM's moments of photographs take, at most."""
+"""Most bytes that SSIM's moments of photos take."""
 
 
-def room_for_photographs(device: torch.device) -> int:
-    """Bytes that photographs may take on a device; on a CPU none, where scenes keep them."""
-    return int(SHARE * torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else 0
+def room_for_photos(device: torch.device) -> int:
+    """Returns the bytes that photos may take on a device; 0 on a CPU, where scenes keep them."""
+    return int(GPU_SHARE * torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else 0
 
 
 @dataclass(eq=False)
-class Photographs:
-    """Of a run's training views."""
+class PhotoCache:
+    """Photos of a run's training views on its device."""
 
     device: torch.device
-    room: int
-    """Bytes that are left for more of them."""
+    room: int = 0
+    """Bytes left for more photos."""
     kept: dict[View, UInt8[Tensor, "3 H W"]] = field(default_factory=dict)
     moments: dict[View, tuple[Tensor, Tensor]] = field(default_factory=dict)
-    """What SSIM takes of photographs alone (`moments_of`)."""
+    """SSIM's moments of photos (`moments_of`)."""
     views: Sequence[View] = ()
-    """Those that are trained on now."""
+    """Views that are trained on now."""
 
     def see(self, views: Sequence[View]) -> None:
-        """From now on these are trained on; all others go."""
+        """Drop photos of all views but these, which are trained on from now on."""
         if views is self.views:
             return
         self.views, wanted = views, set(views)
         for view in [view for view in self.kept if view not in wanted]:
             self.room += self.kept.pop(view).nbytes
-        self.moments = {view: found for view, found in self.moments.items() if view in wanted}
+        self.moments = {view: moments for view, moments in self.moments.items() if view in wanted}
 
     def of(self, view: View) -> Float[Tensor, "3 H W"]:
-        """What `view.image()` is, on the device."""
-        return numbers_of(self.bytes_of(view))
+        """Returns `view.image()` on the device."""
+        return self.bytes_of(view).float() / 255.0
 
     def moments_of(
         self, view: View, target: Float[Tensor, "3 H W"], compiled: bool
@@ -72,8 +71,3 @@ class Photographs:
             if picture.nbytes <= self.room:
                 self.kept[view], self.room = picture, self.room - picture.nbytes
         return picture
-
-
-def numbers_of(photograph: UInt8[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """A photograph in [0, 1]."""
-    return photograph.float() / 255.0
