@@ -22,7 +22,8 @@ from gsx.core.training.backbone import remove_nonfinite
 from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import named_parameters, table_tensors
 from gsx.core.training.photo_cache import PhotoCache
-from gsx.core.training.run import Run, Sampler, TrainingOptions
+from gsx.core.training.run import Run, TrainingOptions
+from gsx.core.training.sampler import Sampler
 from gsx.core.training.trainer import backward, train_step
 from gsx.core.training.training_views import TrainingViews
 

@@ -26,7 +26,8 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.distributed import Ranks, ranks_here
 from gsx.core.training.guard import Agreement
 from gsx.core.training.photo_cache import PhotoCache
-from gsx.core.training.run import Run, Sampler, TrainingOptions
+from gsx.core.training.run import Run, TrainingOptions
+from gsx.core.training.sampler import Sampler
 from gsx.core.training.trainer import train_step
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.build import placed, refuse_uneven

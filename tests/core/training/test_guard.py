@@ -19,7 +19,8 @@ from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import gradients, keep_rows, table_tensors
 from gsx.core.training.photo_cache import PhotoCache
-from gsx.core.training.run import Run, Sampler, StepResult, TrainingOptions
+from gsx.core.training.run import Run, StepResult, TrainingOptions
+from gsx.core.training.sampler import Sampler
 from gsx.core.training.trainer import train, train_step
 from gsx.core.training.training_views import TrainingViews
 

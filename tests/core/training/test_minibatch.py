@@ -26,7 +26,8 @@ from gsx.core.training.parameter_table import (
     zero_grad,
 )
 from gsx.core.training.pseudo_views import PseudoView, Term, pseudo_loss
-from gsx.core.training.run import Run, Sampler
+from gsx.core.training.run import Run
+from gsx.core.training.sampler import Sampler
 from gsx.core.training.trainer import backward, train_step
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.load_scene import load_scene

@@ -20,7 +20,8 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.photo_cache import PhotoCache
-from gsx.core.training.run import Run, Sampler, TrainingOptions
+from gsx.core.training.run import Run, TrainingOptions
+from gsx.core.training.sampler import Sampler
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluator import Evaluator, evenly

@@ -24,7 +24,8 @@ from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.render import render
-from gsx.core.training.run import Run, Sampler, TrainingOptions
+from gsx.core.training.run import Run, TrainingOptions
+from gsx.core.training.sampler import Sampler
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.evaluation import evaluator
 from gsx.experiments.evaluation.eval_options import EvalOptions

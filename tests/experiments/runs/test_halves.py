@@ -22,7 +22,8 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.parameter_table import table_tensors
 from gsx.core.training.photo_cache import PhotoCache
-from gsx.core.training.run import Run, Sampler, TrainingOptions
+from gsx.core.training.run import Run, TrainingOptions
+from gsx.core.training.sampler import Sampler
 from gsx.core.training.trainer import train_step
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.execute import execute

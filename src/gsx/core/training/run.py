@@ -1,7 +1,7 @@
 """A run: everything that belongs to one training, and one step as listeners see it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Protocol, runtime_checkable
 
@@ -15,13 +15,13 @@ from gsx.core.options import without_effect
 from gsx.core.quality.metrics import psnr
 from gsx.core.ranges import Interval, Range, Share
 from gsx.core.rasterizer import RasterSettings, Rendering
-from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, Observation
 from gsx.core.training.distributed import Ranks
 from gsx.core.training.module import Modules
 from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.pseudo_views import Term
+from gsx.core.training.sampler import Sampler
 from gsx.core.training.training_views import TrainingViews
 
 
@@ -45,47 +45,6 @@ class TrainingOptions:
         """What learning rates are multiplied by at a step."""
         steps = self.cooldown * iterations
         return min(1.0, max(0.0, (iterations - step + 1) / steps)) if steps >= 1 else 1.0
-
-
-@dataclass(eq=False)
-class Sampler:
-    """Training views without replacement, reshuffled when all have been seen (3D-GS, train.py).
-
-    Each order comes from the seed and its number alone, so that those to come can be told.
-    """
-
-    count: int
-    seed: int
-    order: list[int] = field(default_factory=list)
-    """What is left of the current order, the next one last."""
-    begun: int = 0
-    """Orders begun so far."""
-    batch: int = 1
-    """Views of one step."""
-    taken: list[int] = field(default_factory=list)
-    """Those of the step under way."""
-
-    def take(self) -> list[int]:
-        """Indices of the views of the next step, in order."""
-        self.taken = [self.next() for _ in range(self.batch)]
-        return self.taken
-
-    def put_back(self) -> None:
-        """Undo `take`: the same views come next again."""
-        self.order += reversed(self.taken)
-        self.taken = []
-
-    def next(self) -> int:
-        """Index of the next view."""
-        if not self.order:
-            generator = torch.Generator().manual_seed(derived_seed("views", self.seed, self.begun))
-            self.order, self.begun = torch.randperm(self.count, generator=generator).tolist(), self.begun + 1
-        return self.order.pop()
-
-    def coming(self, steps: int) -> set[int]:
-        """Indices of the views of the next steps."""
-        ahead = replace(self, order=list(self.order))
-        return {ahead.next() for _ in range(steps * self.batch)}
 
 
 @runtime_checkable
@@ -177,7 +136,7 @@ class Run:
 
     @property
     def train_views(self) -> Sequence[View]:
-        """Training views at the photos' own resolution, with corrected poses and masks."""
+        """Training views at the photos' own resolution, as the modules correct them."""
         return self.views.full_size
 
     @property

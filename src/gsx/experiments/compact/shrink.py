@@ -34,7 +34,8 @@ from gsx.core.training.importance import ROUNDING, Probe, draws_per_view
 from gsx.core.training.module import Modules
 from gsx.core.training.parameter_table import edit, restored_table, size_of, table_tensors
 from gsx.core.training.render import render
-from gsx.core.training.run import Run, Sampler
+from gsx.core.training.run import Run
+from gsx.core.training.sampler import Sampler
 from gsx.core.training.trainer import train_step
 from gsx.experiments.compact.reduction import Reduction
 

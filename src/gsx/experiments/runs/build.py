@@ -21,7 +21,8 @@ from gsx.core.training.distributed import Ranks, ranks_here
 from gsx.core.training.module import ModuleContext, Modules
 from gsx.core.training.photo_cache import PhotoCache, room_for_photos
 from gsx.core.training.regenerator import Regenerator
-from gsx.core.training.run import Run, Sampler
+from gsx.core.training.run import Run
+from gsx.core.training.sampler import Sampler
 from gsx.core.training.training_views import TrainingViews
 from gsx.engine.allocator import keep_freed_memory
 from gsx.engine.cache import MANIFEST, cache_folder, content_key, make_folder

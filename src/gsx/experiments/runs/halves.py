@@ -25,7 +25,8 @@ from gsx.core.training.backbone import Backbone
 from gsx.core.training.guard import Guard
 from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.render import render
-from gsx.core.training.run import Run, Sampler
+from gsx.core.training.run import Run
+from gsx.core.training.sampler import Sampler
 from gsx.core.training.trainer import train_step
 from gsx.core.training.training_views import TrainingViews
 
