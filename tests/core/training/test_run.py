@@ -10,7 +10,7 @@ from gsx.builtin import plugins
 from gsx.core.training import trainer
 from gsx.core.training.run import Run
 from gsx.core.training.sampler import Sampler
-from gsx.engine.compile_cache import counted
+from gsx.engine.compile_cache import training_clock, waiting
 from gsx.experiments.runs.open import start
 
 
