@@ -32,8 +32,8 @@ from gsx.core.training.render import render, render_gaussians
 from gsx.core.training.run import Run
 from gsx.engine.processes import processes
 from gsx.engine.threads import watch_cores
-from gsx.experiments.runs.again import evaluate_again
 from gsx.experiments.runs.compose import compose
+from gsx.experiments.runs.execute import evaluate_again
 from gsx.experiments.runs.export import export, refuse_export
 from gsx.experiments.runs.job import train as train_job
 from gsx.experiments.runs.messages import set_up_logging as show_messages

@@ -18,8 +18,7 @@ from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.parameter_table import table_tensors
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.compose import compose
-from gsx.experiments.runs.load_scene import in_units, warned_of_units
-from gsx.experiments.runs.scene_extent import measured
+from gsx.experiments.runs.load_scene import in_units, measured, warned_of_units
 from gsx.experiments.runs.settings import Settings
 
 BACKBONES = {

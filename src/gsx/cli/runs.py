@@ -38,7 +38,7 @@ def verb_eval(arguments: list[str]) -> int:
     if suffix_of(file) and not file.is_dir():
         return evaluate_file(file, overrides)
     with loading():
-        from gsx.experiments.runs.again import evaluate_again
+        from gsx.experiments.runs.execute import evaluate_again
 
     evaluate_again(folder, plugins(), overrides)
     sys.stdout.write(f"{folder / 'report.html'}\n")
@@ -287,7 +287,7 @@ def converted(source: Path, given: argparse.Namespace, spz: "SpzForm") -> Path:
     Raises:
         InputError: it names no file to write, an option is for runs alone, or the file cannot be read or written.
     """
-    from gsx.experiments.runs.convert import convert
+    from gsx.experiments.runs.export import convert
 
     if given.file is None:
         raise InputError(f"gsx export {source}: name the file to write as well, for example model.ply")

@@ -20,9 +20,9 @@ from gsx.experiments.compact.shrink import judges
 from gsx.experiments.evaluation.remarks import NOT_MEASURED
 from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.files import LOG, read_run, state_of
-from gsx.experiments.runs.again import evaluate_again
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.evaluate import summary
+from gsx.experiments.runs.execute import evaluate_again
 from gsx.experiments.runs.export import export, losses, shown_views
 from gsx.experiments.runs.load_scene import held_out_none, load_scene
 from gsx.experiments.runs.open import open_run

@@ -19,8 +19,7 @@ from gsx.core.errors import InputError
 from gsx.experiments.runs.capture import capture_lines
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.inspect import describe
-from gsx.experiments.runs.load_scene import load_scene
-from gsx.experiments.runs.scene_extent import in_one_place, measured
+from gsx.experiments.runs.load_scene import in_one_place, load_scene, measured
 
 PLACE = (0.1, 0.2, 0.3)
 NOTE = "all training cameras stand at one place"

@@ -1,9 +1,10 @@
-"""Trains from the current step on, evaluates, exports, reports."""
+"""Trains from the current step on, evaluates, exports, reports; evaluates again."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from gsx.core.errors import CompilerError, LostModel, first_line
@@ -17,11 +18,13 @@ from gsx.engine.cache import cache_root, trim
 from gsx.engine.compile_cache import training_clock
 from gsx.experiments.evaluation.remarks import CapNotice
 from gsx.experiments.reports.report import write_report
+from gsx.experiments.run_folder.claims import claimed
 from gsx.experiments.run_folder.files import SPLATS
 from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.environment import announce
 from gsx.experiments.runs.evaluate import evaluate
 from gsx.experiments.runs.export import export
+from gsx.experiments.runs.open import as_trained, open_run, refuse_other, refuse_training
 from gsx.experiments.runs.progress import MetricsLog, Progress
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.settings import Settings
@@ -165,3 +168,25 @@ def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:
     write_report(run.folder)
     plugins.emit.gsx_run_finished(run=run)
     return evaluation
+
+
+def evaluate_again(folder: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """Writes evaluation.json, pictures, splat file and report of a run, drawn by the path that trained it.
+
+    Raises:
+        ConfigError, InputError: an override is wrong, the folder is no run, or somebody trains in it.
+        CheckpointError: there is no usable checkpoint.
+    """
+    refuse_other(folder)
+    refuse_training(folder, overrides)
+    with claimed(folder):
+        remove_partial(folder)
+        run, settings = open_run(folder, plugins, overrides)
+        run.raster = as_trained(run)
+        warm(run)
+        if run.complete:
+            return finish(run, settings, plugins)
+        evaluation = evaluate(run, settings)
+        plugins.emit.gsx_evaluated(run=run, evaluation=evaluation)
+        write_report(folder)
+        return evaluation

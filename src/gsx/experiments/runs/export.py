@@ -1,4 +1,4 @@
-"""Splat files of a run, and pages that show one."""
+"""Splat files of a run or of another file, and pages that show one."""
 
 import logging
 from collections.abc import Sequence
@@ -24,15 +24,15 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.reports.viewer_page import viewer_page
 from gsx.experiments.runs.bake import bake
-from gsx.experiments.runs.coordinates import COMMENTED, log_coordinates, placement, refuse_too_far
 from gsx.experiments.runs.load_scene import unit_of
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.arrays import arrays_of, gaussians_from
 from gsx.formats.axis_names import AUTO
 from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply
-from gsx.formats.origin import NO_ORIGIN, Origin, around, in_words
+from gsx.formats.origin import NO_ORIGIN, Origin, around, away, comment_of, in_words, rounding_at
 from gsx.formats.ply import write_whole
-from gsx.formats.splat_files import SpzForm, read_splats, write_columns, write_gaussians
+from gsx.formats.splat_files import SpzForm, compensated, read_around, read_splats, write_columns, write_gaussians
+from gsx.formats.spz import FURTHEST
 from gsx.formats.suffixes import STANDARD, refuse_suffix, suffix_of
 
 PAGE = ".html"
@@ -40,7 +40,7 @@ PAGE = ".html"
 PAGE_VIEWS = 6
 """Test views that a page has as places to go to; it starts at the first."""
 LOOKED_AT = 5
-"""Views by which losses are told."""
+"""Views by which losses are measured."""
 SPZ_FORM = SpzForm()
 
 logger = logging.getLogger(__name__)
@@ -227,3 +227,83 @@ def mean_psnr(pictures: Sequence[Float[Tensor, "3 H W"]], others: Sequence[Float
 def as_in_page(gaussians: Gaussians) -> Gaussians:
     """Returns Gaussians as a page holds them, but not turned."""
     return gaussians_from(decode_compressed_ply(encode_compressed_ply(arrays_of(gaussians), ())))
+
+
+# -- of another file ---------------------------------------------------------------------------------------------------
+
+
+def convert(source: Path, to: Path, axes: str = AUTO, spz: SpzForm = SPZ_FORM, local: bool = False) -> None:
+    """Writes the splats of a file as the kind that the other name says, with its mark for compensated opacities.
+
+    axes: of the file that is read; spz: form of a .spz that is written; local: positions relative to an origin, where
+    they are far from (0, 0, 0).
+
+    Raises:
+        InputError: one of them cannot be read or written, or both are the same file.
+    """
+    refuse_suffix(to)
+    if to.resolve() == source.resolve():
+        raise InputError(f"{to} is the file to read: name another to write")
+    (gaussians, origin), mip = read_around(source, axes), compensated(source)
+    if not len(gaussians.means):
+        raise InputError(f"{source} holds no splats: choose another file")
+    comments = [f"gsx {__version__}, from {source.name}", f"SplatRenderMode: {'mip' if mip else 'default'}"]
+    added, stated = placement(origin, local)
+    refuse_too_far(to, gaussians, added)
+    write_gaussians(to, gaussians, [*comments, *stated], mip, spz, added)
+    if local and not any(origin):
+        logger.info("--local changes nothing: the positions of %s are near (0, 0, 0)", source)
+    log_axes_written(to, spz)
+    log_coordinates(to, origin, local, gaussians)
+    written = len(read_again(to, spz).means)
+    logger.info("%s: %d splats read, %d written, %.2f MB", to, len(gaussians.means), written, to.stat().st_size / 1e6)
+
+
+# -- coordinates far from (0, 0, 0) ------------------------------------------------------------------------------------
+
+COMMENTED = (STANDARD, ".compressed.ply", ".glb", "")
+"""Suffixes of files that hold comments; empty: of pages, which do."""
+
+
+def placement(origin: Origin, local: bool) -> tuple[Origin, list[str]]:
+    """Returns (what is added to positions of a file, comments): the origin, or its statement in a `local` file."""
+    if not any(origin):
+        return NO_ORIGIN, []
+    return (NO_ORIGIN, [comment_of(origin)]) if local else (origin, [])
+
+
+def refuse_too_far(path: Path, gaussians: Gaussians, origin: Origin) -> None:
+    """Raises InputError for SPZ where it cannot hold coordinates, with the remedies that exports have."""
+    if not any(origin) or suffix_of(path) != ".spz" or not len(gaussians.means):
+        return
+    furthest = float(away(gaussians, origin).means.abs().max())
+    if furthest > FURTHEST:
+        raise InputError(
+            f"{path} is not written: SPZ holds coordinates up to {FURTHEST:,.0f}, the scene's reach {furthest:,.0f}. "
+            f"Add --local for positions relative to {in_words(origin)}, or export .ply or .glb, which hold them exactly"
+        )
+
+
+def log_coordinates(path: Path, origin: Origin, local: bool, gaussians: Gaussians | None = None) -> None:
+    """Logs in which coordinates the file of a scene far from (0, 0, 0) is, and what that costs."""
+    if not any(origin):
+        return
+    suffix, middle = suffix_of(path), in_words(origin)
+    step = rounding_at(torch.tensor([origin]))
+    scales = "" if gaussians is None else f" ({step / median_scale(gaussians):.2g} x the median scale of splats)"
+    steps, remedy = f"steps of {step:.2g} units{scales}", f"--local writes them relative to {middle}"
+    if local:
+        states = "as its comment states" if suffix in COMMENTED else f"which {suffix} has no place to state"
+        message = f"positions are relative to {middle}, {states}"
+    elif suffix == ".glb":
+        message = f"positions are the scene's own: floats, to which the node adds {middle} exactly"
+    elif suffix == ".compressed.ply":
+        message = f"positions are the scene's own; ends of chunks are floats, rounded to {steps}: {remedy}"
+    else:
+        message = f"positions are the scene's own; programs that read floats alone round them to {steps}: {remedy}"
+    logger.info("%s: %s", path, message)
+
+
+def median_scale(gaussians: Gaussians) -> float:
+    """Returns the median standard deviation of Gaussians along their axes, scene units."""
+    return float(gaussians.log_scales.median().exp()) if len(gaussians.means) else 1.0

@@ -15,15 +15,17 @@ from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Float
 from gsx.core.training.render import render_gaussians
 from gsx.experiments.runs.settings import Settings
-from gsx.experiments.runs.start_checks import (
+from gsx.experiments.runs.start_file import (
     MOST_SPLATS,
     MOST_VIEWS,
     distance_from_points,
     evident_points,
+    in_scene,
+    origin_of_file,
     reaching,
     spread,
+    start_doubts,
 )
-from gsx.experiments.runs.start_file import in_scene, origin_of_file, start_doubts
 from gsx.formats.axes import flipped
 from gsx.formats.axis_names import FIXED, SPECIFIED, TRAINED
 from gsx.formats.origin import around

@@ -18,8 +18,8 @@ from gsx.core.plugins import Component, Plugins
 from gsx.experiments.run_folder.files import BEGUN
 from gsx.experiments.runs.capture import capture_lines
 from gsx.experiments.runs.compose import compose_raw, hydra_session
+from gsx.experiments.runs.load_scene import in_one_place, measured
 from gsx.experiments.runs.overrides import word_of
-from gsx.experiments.runs.scene_extent import in_one_place, measured
 from gsx.experiments.runs.typed import typed
 from gsx.formats.suffixes import META, splat_file_at, suffix_of
 from gsx.scenes.origin import around_origin, origin_of

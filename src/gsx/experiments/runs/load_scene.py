@@ -1,24 +1,25 @@
 """A scene as a run needs it: in units that constants expect, with views to evaluate on."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import torch
 
-from gsx.core.data.camera import Camera
-from gsx.core.data.scene import Scene, View
+from gsx.core.data.camera import Camera, offsets_from
+from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import at_home, file_count
 from gsx.core.seeds import derived_seed
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.remarks import NOT_MEASURED
 from gsx.experiments.runs.degraded import degrade
-from gsx.experiments.runs.scene_extent import measured
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.origin import Origin
 from gsx.scenes.filling import filled
 from gsx.scenes.origin import around_origin, origin_of
+from gsx.scenes.posed import SAME_PLACE
 
 HIDDEN_SHARE, LARGEST_EXTENT = 0.02, 1e3
 """If near planes hide more of the points, or cameras stand farther apart, units are not those that 3D-GS expects."""
@@ -182,3 +183,43 @@ def warned_of_units(scene: Scene) -> Scene:
 def unit_of(run: Run) -> float:
     """Returns what the scene's positions were multiplied by."""
     return float(run.config["scene"].get("unit", 1.0))
+
+
+# -- cameras in one place: the points alone say how large the scene is -------------------------------------------------
+
+ONE_PLACE = 3e-5
+"""Extent of cameras, as a share of the points' median distance, that is rounding: at a focal length of 3,000 px they
+see points move by 0.1 px, which no reconstruction measures. Rounded poses are at 1e-6, close-ups above 1e-3."""
+
+
+def point_distance(cameras: Sequence[Camera], points: PointCloud) -> float:
+    """Returns the median distance of the points from the first camera, scene units; 0 without points."""
+    if len(points) == 0:
+        return 0.0
+    return float(offsets_from(points.positions, cameras[0].centre).norm(dim=1).median())
+
+
+def rounding_extent(cameras: Sequence[Camera], points: PointCloud) -> float:
+    """Returns the largest extent that is rounding: by the points' distances, or without points in scene units."""
+    return ONE_PLACE * point_distance(cameras, points) if len(points) else SAME_PLACE
+
+
+def in_one_place(cameras: Sequence[Camera], points: PointCloud) -> bool:
+    """Returns whether distances between cameras are rounding."""
+    return extent_of(cameras) <= rounding_extent(cameras, points)
+
+
+def measured(scene: Scene) -> Scene:
+    """Returns the scene; if its training cameras stand in one place, its extent is 1.1 x the points' median distance.
+
+    Without points, such a scene has the extent 0.
+    """
+    cameras = [view.camera for view in scene.train]
+    if scene.extent > rounding_extent(cameras, scene.points):
+        return scene
+    extent = 1.1 * point_distance(cameras, scene.points)
+    note = (
+        f"all training cameras stand at one place: the extent {extent:.3g} is 1.1 x the points' median distance, and "
+        "photos show no depth; take them from different places"
+    )
+    return replace(scene, extent=extent, notes=[*scene.notes, note])

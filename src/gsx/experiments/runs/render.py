@@ -19,8 +19,7 @@ from gsx.engine.threads import watch_cores
 from gsx.experiments.reports.pictures import file_names
 from gsx.experiments.runs.orbit import orbit_cameras, write_animation
 from gsx.experiments.runs.settings import Settings
-from gsx.experiments.runs.start_checks import refuse_nothing_in_view
-from gsx.experiments.runs.start_file import rules_of
+from gsx.experiments.runs.start_file import refuse_nothing_in_view, rules_of
 from gsx.experiments.viewer.camera_path import CameraPath
 from gsx.formats.axis_names import AUTO
 from gsx.formats.splat_files import read_around
