@@ -26,7 +26,7 @@ from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
 from gsx.experiments.runs.saved_settings import read_config, write_config
-from gsx.experiments.runs.tracking import Tracking, build_trackers
+from gsx.experiments.runs.tracking import Tracking
 from gsx.experiments.runs.warm_start import warm_start_folder
 from gsx.trackers.figures import evaluation_figures, line_figures
 
@@ -328,7 +328,3 @@ def test_nothing_is_asked_of_the_network_and_little_is_said(tracked: Tracked) ->
     assert not re.search(r"(?i)warn|alembic|INFO", result.stderr), result.stderr
     names = {path.name for path in folder.iterdir()}
     assert names == {"run", "mlflow.db", "mlflow_files", ".mlflow.lock"}
-
-
-def test_an_empty_choice_builds_nothing() -> None:
-    assert build_trackers({}) == []
