@@ -28,19 +28,19 @@ def run_arguments(verb: str, arguments: list[str], description: str, flags: str 
     parser = Parser(prog=f"gsx {verb}", usage=f"%(prog)s RUN [KEY=VALUE ...]{flags}", description=description)
     parser.add_argument("run", metavar="RUN", help="run folder")
     parser.add_overrides("values that take the place of the run's own")
-    given = parser.parse_args(arguments)
-    if "=" in given.run and not Path(given.run).exists():
+    options = parser.parse_args(arguments)
+    if "=" in options.run and not Path(options.run).exists():
         raise InputError(f"gsx {verb} needs a run folder: gsx {verb} RUN [KEY=VALUE ...]")
-    return Path(given.run), given.overrides
+    return Path(options.run), options.overrides
 
 
 class Parser(argparse.ArgumentParser):
     """Mistakes become errors of ours: one sentence, without the usage text."""
 
-    def add_overrides(self, told: str) -> None:
+    def add_overrides(self, description: str) -> None:
         """Adds KEY=VALUE, as many as there are, as `overrides`."""
         # argparse calls required what has no default
-        self.add_argument("overrides", nargs="*", default=[], metavar="KEY=VALUE", help=told)
+        self.add_argument("overrides", nargs="*", default=[], metavar="KEY=VALUE", help=description)
 
     def error(self, message: str) -> NoReturn:
         """Raises ConfigError."""

@@ -14,13 +14,13 @@ def verb_report(arguments: list[str]) -> int:
     parser = Parser(prog="gsx report", description="Report of a run, or one page over all runs of some folders.")
     parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="run, or folder with runs below it")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for the page (DIR, or what several share)")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     with loading():
         from gsx.experiments.reports.report import report_on
 
-    if given.to and given.to.exists():
-        new_folder(given.to)  # or it is a file
-    sys.stdout.write(f"{report_on(given.folders, given.to)}\n")
+    if options.to and options.to.exists():
+        new_folder(options.to)  # or it is a file
+    sys.stdout.write(f"{report_on(options.folders, options.to)}\n")
     return 0
 
 
@@ -36,11 +36,11 @@ def verb_scenes(arguments: list[str]) -> int:
         action="store_true",
         help="find the poses of photographs that have none, which takes minutes, and judge the coverage",
     )
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     with loading():
         from gsx.experiments.runs.inspect import describe
 
-    lines = describe(given.path, plugins(), given.poses)
+    lines = describe(options.path, plugins(), options.poses)
     sys.stdout.write("\n".join(lines) + "\n")
     return 2 if any(line.startswith("problem") for line in lines) else 0
 
@@ -65,27 +65,27 @@ def verb_datasets(arguments: list[str]) -> int:
         for name in names:
             if name not in known:
                 raise InputError(f"'{name}' is no dataset; there are {', '.join(known)}.{nearest(name, known)}")
-            asked = [f"dataset={name}", *overrides]
-            root = Path(str(compositions.value(asked, "data_root")))
+            words = [f"dataset={name}", *overrides]
+            root = Path(str(compositions.value(words, "data_root")))
             if any(word.startswith("data_root=") for word in overrides) and not root.is_dir():
                 raise InputError(f"data_root={root} is no folder: give the one below which datasets lie")
-            sys.stdout.write("\n".join(described(compositions.node(asked, "dataset"), root)) + "\n")
+            sys.stdout.write("\n".join(described(compositions.node(words, "dataset"), root)) + "\n")
     return 0
 
 
 def verb_explain(arguments: list[str]) -> int:
     """gsx explain KEY [KEY=VALUE ...]"""
-    told = "What a key of the configuration is, or a group: its value, what else it may be, who says so, and why."
-    parser = Parser(prog="gsx explain", usage="%(prog)s KEY [KEY=VALUE ...]", description=told)
+    description = "What a key of the configuration is, or a group: its value, what it may be, who says so, and why."
+    parser = Parser(prog="gsx explain", usage="%(prog)s KEY [KEY=VALUE ...]", description=description)
     parser.add_argument(
         "key", metavar="KEY", help="for example training.supersampling.factor, backbone, backbone=scaffold"
     )
     parser.add_overrides("in this composition instead of the default")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     with loading():
         from gsx.experiments.runs.explain import explain
 
-    sys.stdout.write("\n".join(explain(given.key, given.overrides, plugins())) + "\n")
+    sys.stdout.write("\n".join(explain(options.key, options.overrides, plugins())) + "\n")
     return 0
 
 

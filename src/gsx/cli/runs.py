@@ -71,14 +71,14 @@ def verb_photographs(arguments: list[str]) -> int:
     parser.add_argument("--worst", type=positive(int), default=10, help="photographs that are shown (10)")
     if not arguments and Path("photographs").is_dir():
         raise InputError("gsx photographs RUN judges a run's photographs: to train from that folder, gsx ./photographs")
-    given = parser.parse_intermixed_args(arguments)
+    options = parser.parse_intermixed_args(arguments)
     with loading():
         from gsx.experiments.runs.photographs import judge_photographs, lines
 
-    findings = judge_photographs(given.run, plugins(), given.worst, given.overrides)
-    for line in lines(findings, given.worst):
+    findings = judge_photographs(options.run, plugins(), options.worst, options.overrides)
+    for line in lines(findings, options.worst):
         logger.info("%s", line)
-    sys.stdout.write(f"{given.run / 'report.html'}\n")
+    sys.stdout.write(f"{options.run / 'report.html'}\n")
     return 0
 
 
@@ -90,10 +90,10 @@ def add_axes(parser: Parser, flag: str = "--axes") -> None:
     parser.add_argument(flag, choices=CHOICES, default=AUTO, metavar="AXES", help=values)
 
 
-def refuse_axes_of_run(verb: str, given: argparse.Namespace) -> None:
+def refuse_axes_of_run(verb: str, options: argparse.Namespace) -> None:
     """Raises InputError for --axes of a run, whose axes are those of its scene."""
-    if given.axes != AUTO and splat_file_at(given.target).is_dir():
-        raise InputError(f"{verb}: --axes {given.axes} is for splat files, {given.target} is a run: leave it out")
+    if options.axes != AUTO and splat_file_at(options.target).is_dir():
+        raise InputError(f"{verb}: --axes {options.axes} is for splat files, {options.target} is a run: leave it out")
 
 
 def verb_render(arguments: list[str]) -> int:
@@ -109,22 +109,22 @@ def verb_render(arguments: list[str]) -> int:
     parser.add_argument("--zoom", type=float, default=1, help="times the training resolution, or that of the path (1)")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for pictures (RUN/renders/test, or path)")
     add_axes(parser)
-    given = parser.parse_args(arguments)
-    refuse_axes_of_run(parser.prog, given)
-    refuse_beyond("gsx render --zoom", given.zoom, ZOOMS)
-    refuse_beyond("gsx render --frames", given.frames, Range(1, MOST_FRAMES))
-    refuse_beyond("gsx render --fps", given.fps, Range(0.1, 240))
-    if not given.orbit and (given.frames, given.fps) != (parser.get_default("frames"), parser.get_default("fps")):
+    options = parser.parse_args(arguments)
+    refuse_axes_of_run(parser.prog, options)
+    refuse_beyond("gsx render --zoom", options.zoom, ZOOMS)
+    refuse_beyond("gsx render --frames", options.frames, Range(1, MOST_FRAMES))
+    refuse_beyond("gsx render --fps", options.fps, Range(0.1, 240))
+    if not options.orbit and (options.frames, options.fps) != (parser.get_default("frames"), parser.get_default("fps")):
         raise InputError("gsx render: --frames and --fps go with --orbit FILE")
-    if (given.movie and not given.path) or (given.orbit and given.path):
+    if (options.movie and not options.path) or (options.orbit and options.path):
         raise InputError("gsx render: --movie FILE goes with --path JSON, --orbit FILE alone")
-    if given.to and (given.movie or given.orbit):
+    if options.to and (options.movie or options.orbit):
         raise InputError("gsx render: --to FOLDER is for pictures; --movie and --orbit name their own FILE")
-    sys.stdout.write(f"{rendered(given)}\n")
+    sys.stdout.write(f"{rendered(options)}\n")
     return 0
 
 
-def rendered(given: argparse.Namespace) -> Path:
+def rendered(options: argparse.Namespace) -> Path:
     """Carries out `gsx render`; returns the file or folder written."""
     with loading():
         from gsx.core.files import remove_partial
@@ -138,24 +138,24 @@ def rendered(given: argparse.Namespace) -> Path:
         )
         from gsx.experiments.viewer.camera_path import read_camera_path
 
-    way = read_camera_path(given.path) if given.path else None
-    file = splat_file_at(given.target)
+    way = read_camera_path(options.path) if options.path else None
+    file = splat_file_at(options.target)
     if file.is_file():
         if way is None:
-            raise InputError(f"gsx render {given.target}: a splat file has no views; give cameras with --path JSON")
-        to = given.movie or given.to or file.parent / "path"
-        draw = file_pictures(file, way.cameras(given.zoom), given.axes)
-        return render_path(way, draw, to, bool(given.movie), given.zoom)
-    run, settings = open_run(given.target, plugins())
-    remove_partial(given.target / "renders")
+            raise InputError(f"gsx render {options.target}: a splat file has no views; give cameras with --path JSON")
+        to = options.movie or options.to or file.parent / "path"
+        draw = file_pictures(file, way.cameras(options.zoom), options.axes)
+        return render_path(way, draw, to, bool(options.movie), options.zoom)
+    run, settings = open_run(options.target, plugins())
+    remove_partial(options.target / "renders")
     if way is not None:
-        to = given.movie or given.to or given.target / "renders" / "path"
-        return render_path(way, run_pictures(run, settings), to, bool(given.movie), given.zoom, given.target)
-    if given.orbit:
-        render_orbit(run, settings, given.orbit, given.frames, given.fps, given.zoom)
-        return Path(given.orbit)
-    folder: Path = given.to or given.target / "renders" / "test"
-    render_test_views(run, settings, folder, given.zoom)
+        to = options.movie or options.to or options.target / "renders" / "path"
+        return render_path(way, run_pictures(run, settings), to, bool(options.movie), options.zoom, options.target)
+    if options.orbit:
+        render_orbit(run, settings, options.orbit, options.frames, options.fps, options.zoom)
+        return Path(options.orbit)
+    folder: Path = options.to or options.target / "renders" / "test"
+    render_test_views(run, settings, folder, options.zoom)
     return folder
 
 
@@ -167,10 +167,10 @@ def verb_view(arguments: list[str]) -> int:
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (127.0.0.1: this machine alone)")
     parser.add_argument("--port", type=whole, default=8080, help="port (8080); 0: any that is free")
     add_axes(parser)
-    given = parser.parse_args(arguments)
-    if not given.target.exists():
-        raise InputError(f"'{given.target}' does not exist: give a run folder or a splat file")
-    refuse_axes_of_run(parser.prog, given)
+    options = parser.parse_args(arguments)
+    if not options.target.exists():
+        raise InputError(f"'{options.target}' does not exist: give a run folder or a splat file")
+    refuse_axes_of_run(parser.prog, options)
     with loading():
         from gsx.experiments.runs.view import view_file, view_run
 
@@ -180,11 +180,11 @@ def verb_view(arguments: list[str]) -> int:
         sys.stdout.flush()
 
     try:
-        file = splat_file_at(given.target)
+        file = splat_file_at(options.target)
         if file.is_dir():
-            view_run(file, plugins(), given.host, given.port, announce)
+            view_run(file, plugins(), options.host, options.port, announce)
         else:
-            view_file(file, given.axes, given.host, given.port, announce)
+            view_file(file, options.axes, options.host, options.port, announce)
     except KeyboardInterrupt:
         return 0
     return 0
@@ -193,20 +193,20 @@ def verb_view(arguments: list[str]) -> int:
 def verb_export(arguments: list[str]) -> int:
     """gsx export RUN|FILE [TO] [--view NAME] [--bake ZOOM] [--axes rub|rdf] [--spz-version 3|4] [--from-axes AXES]
     [--local]"""
-    given = export_parser().parse_args(arguments)
+    options = export_parser().parse_args(arguments)
     with loading():
         from gsx.experiments.runs.export import refuse_export
         from gsx.formats.splat_files import SpzForm
 
-    spz = SpzForm(version=given.spz_version, axes=given.axes)
-    refuse_export(given.file or Path("point_cloud.ply"), spz)
-    if given.bake:
-        refuse_beyond("gsx export --bake", given.bake, ZOOMS)
-    if given.view and given.bake:
+    spz = SpzForm(version=options.spz_version, axes=options.axes)
+    refuse_export(options.file or Path("point_cloud.ply"), spz)
+    if options.bake:
+        refuse_beyond("gsx export --bake", options.bake, ZOOMS)
+    if options.view and options.bake:
         raise InputError("gsx export: --view NAME is what one view draws, --bake ZOOM a file for all: give one of them")
-    source = splat_file_at(given.run)
+    source = splat_file_at(options.run)
     is_file = bool(suffix_of(source)) and not source.is_dir()
-    sys.stdout.write(f"{converted(source, given, spz) if is_file else exported(given, spz)}\n")
+    sys.stdout.write(f"{converted(source, options, spz) if is_file else exported(options, spz)}\n")
     return 0
 
 
@@ -247,7 +247,7 @@ def export_parser() -> Parser:
     return parser
 
 
-def exported(given: argparse.Namespace, spz: "SpzForm") -> Path:
+def exported(options: argparse.Namespace, spz: "SpzForm") -> Path:
     """Writes the model of a run as a splat file or a page; returns that.
 
     Raises:
@@ -260,28 +260,28 @@ def exported(given: argparse.Namespace, spz: "SpzForm") -> Path:
         from gsx.experiments.runs.open import open_run
         from gsx.experiments.runs.render import view_named
 
-    if given.from_axes != AUTO:
+    if options.from_axes != AUTO:
         raise InputError(
-            f"gsx export: --from-axes {given.from_axes} is for splat files, {given.run} is a run: leave it out"
+            f"gsx export: --from-axes {options.from_axes} is for splat files, {options.run} is a run: leave it out"
         )
-    run, settings = open_run(given.run, plugins())
-    view = view_named(run, given.view) if given.view else None
-    stem = "point_cloud_of_view" if view else "point_cloud_baked" if given.bake else "point_cloud"
-    path: Path = given.file or given.run / f"{stem}.ply"
+    run, settings = open_run(options.run, plugins())
+    view = view_named(run, options.view) if options.view else None
+    stem = "point_cloud_of_view" if view else "point_cloud_baked" if options.bake else "point_cloud"
+    path: Path = options.file or options.run / f"{stem}.ply"
     remove_partial(path.parent, below=False)
-    if given.local and not any(run.scene.origin):
+    if options.local and not any(run.scene.origin):
         logger.info("--local changes nothing: %s was trained in its own coordinates", run.scene.name)
-    written = export(run, path, view.camera if view else None, spz, given.bake, given.local)
+    written = export(run, path, view.camera if view else None, spz, options.bake, options.local)
     if written:
         views = [view] if view else shown_views(run.scene)
-        for line in losses(run, settings, path, views, written, spz, given.local):
+        for line in losses(run, settings, path, views, written, spz, options.local):
             logger.info("read back and rendered again: %s", line)
-    if is_page(path) and path.parent.resolve() == given.run.resolve():
-        write_report(given.run)  # it links to its pages
+    if is_page(path) and path.parent.resolve() == options.run.resolve():
+        write_report(options.run)  # it links to its pages
     return path
 
 
-def converted(source: Path, given: argparse.Namespace, spz: "SpzForm") -> Path:
+def converted(source: Path, options: argparse.Namespace, spz: "SpzForm") -> Path:
     """Writes the splats of a file as a file of another kind; returns that.
 
     Raises:
@@ -289,9 +289,9 @@ def converted(source: Path, given: argparse.Namespace, spz: "SpzForm") -> Path:
     """
     from gsx.experiments.runs.export import convert
 
-    if given.file is None:
+    if options.file is None:
         raise InputError(f"gsx export {source}: name the file to write as well, for example model.ply")
-    if given.view or given.bake:
+    if options.view or options.bake:
         raise InputError(f"gsx export: --view and --bake are for runs, and {source} is a splat file: leave them out")
-    convert(source, given.file, given.from_axes, spz, given.local)
-    return Path(given.file)
+    convert(source, options.file, options.from_axes, spz, options.local)
+    return Path(options.file)

@@ -85,13 +85,13 @@ def hand_to_hydra(arguments: list[str]) -> int:
         finally:  # it may end the program
             sys.stdout.write(text.getvalue())
         return 0
-    given = with_quoted_paths([word for word in arguments if not word.startswith("-")])
+    overrides = with_quoted_paths([word for word in arguments if not word.startswith("-")])
     refuse_for_sweeps(arguments)
-    output, of_launcher = check_overrides(given, loaded)
+    output, of_launcher = check_overrides(overrides, loaded)
     sweep, code = stamped_folder(output / "sweeps"), 0
     try:
         with waiting_for_all(sweep):
-            launch(["-m", *given, *of_launcher, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
+            launch(["-m", *overrides, *of_launcher, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
     except KeyboardInterrupt:
         say("\ngsx: interrupted; runs that were begun say above how to go on\n", as_error=True)
         code = INTERRUPTED

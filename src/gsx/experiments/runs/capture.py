@@ -73,9 +73,9 @@ def light_at(view: View, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
     planes = avg_pool2d(torch.cat([light * known, known[None]])[None], max(1, view.camera.width // LOOKED_AT))
     pixels, _ = view.camera.project(points)
     places = 2 * pixels / pixels.new_tensor(view.camera.size) - 1
-    found = grid_sample(planes, places.float()[None, None], align_corners=False)[0, :, 0]
-    usable = view.camera.sees(points) & (found[3] > 0.5)
-    return torch.where(usable, found[:3] / found[3], torch.nan).T
+    samples = grid_sample(planes, places.float()[None, None], align_corners=False)[0, :, 0]
+    usable = view.camera.sees(points) & (samples[3] > 0.5)
+    return torch.where(usable, samples[:3] / samples[3], torch.nan).T
 
 
 def exposure(view: View, points: Float[Tensor, "P 3"], colours: Float[Tensor, "P 3"]) -> tuple[float, float]:
@@ -106,9 +106,9 @@ def exposures(views: Sequence[View], cloud: PointCloud) -> Float[Tensor, "V"] | 
     """
     step = max(1, len(cloud) // POINTS)
     points, colours = cloud.positions[::step], linear_from_display(cloud.colours[::step].float() / 255)
-    found = [exposure(view, points, colours) for view in views]
-    gains = torch.tensor([gain for gain, _ in found])
-    return gains - gains.nanmedian() if median(share for _, share in found) > TRUSTED else None
+    estimates = [exposure(view, points, colours) for view in views]
+    gains = torch.tensor([gain for gain, _ in estimates])
+    return gains - gains.nanmedian() if median(share for _, share in estimates) > TRUSTED else None
 
 
 def exposure_line(views: Sequence[View], gains: Float[Tensor, "V"]) -> str:

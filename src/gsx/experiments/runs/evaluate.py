@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     """Writes evaluation.json and the pictures of a run."""
-    options, begun = settings.evaluation, time.perf_counter()
+    options, started = settings.evaluation, time.perf_counter()
     evaluator, pictures = Evaluator(run, options), Pictures(run.folder / "renders", run.step)
     if run.scene.test:
         logger.info("evaluating %d test views at zoom %s", len(run.scene.test), options.zoom)
@@ -32,11 +32,14 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
         embellish(run, pictures, options)
     pictures.write_index()
     write_pseudo_pictures(run, options)
-    evaluation |= {"evaluate_seconds": time.perf_counter() - begun, "settings": evaluation_settings(settings.resolved)}
+    evaluation |= {
+        "evaluate_seconds": time.perf_counter() - started,
+        "settings": evaluation_settings(settings.resolved),
+    }
     files = read_run(run.folder)
     if doubts := files.environment.get("start"):
         evaluation["start"] = doubts
-    tell_of_paths(files.evaluation, evaluation)
+    warn_of_paths(files.evaluation, evaluation)
     write_json(run.folder / "evaluation.json", evaluation)
     for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy)]:
         logger.info("%s", line)
@@ -57,7 +60,7 @@ def embellish(run: Run, pictures: Pictures, options: EvalOptions) -> None:
         logger.warning("the report has no depth or flight (%s)", first_line(error))
 
 
-def tell_of_paths(before: dict[str, Any], now: dict[str, Any]) -> None:
+def warn_of_paths(before: dict[str, Any], now: dict[str, Any]) -> None:
     """Warns if another path of the rasterizer has drawn what was timed in an earlier evaluation."""
     path = before.get("render_path")
     if path and path != now["render_path"] and before.get("render_fps"):

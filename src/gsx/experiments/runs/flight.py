@@ -20,12 +20,12 @@ LONGEST = 320
 """Longer side of its frames, px."""
 DEEPEST = 4.0
 """Zoom it ends at where no finer truth is known."""
-SEEN = 0.5
-"""Coverage from which on depth is told."""
+COVERED = 0.5
+"""Coverage from which on a pixel has a depth."""
 INNER = 0.02
 """Share of the nearest and of the farthest pixels that the colours of depth pass over."""
 ENOUGH = 1_000_000
-"""Pixels that tell these."""
+"""Pixels that these are estimated from."""
 
 
 def add_depth(run: Run, pictures: Pictures, pixels: int) -> None:
@@ -43,8 +43,8 @@ def depth_and_coverage(run: Run, camera: Camera, pixels: int) -> tuple[Float[Ten
     """
     splats = splats_for(run, camera)
     both = coverage_and_depth(splats, behind_scene(run.backbone, splats.means), camera)
-    shown = replace(splats, colours=torch.cat([both, both[:, :1]], 1))
-    coverage, summed, _ = rasterize_tiled(shown, camera, run.raster, pixels=pixels).image
+    with_depth = replace(splats, colours=torch.cat([both, both[:, :1]], 1))
+    coverage, summed, _ = rasterize_tiled(with_depth, camera, run.raster, pixels=pixels).image
     return summed, coverage
 
 
@@ -52,14 +52,14 @@ def depth_colours(
     summed: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"]
 ) -> tuple[Float[Tensor, "3 H W"], list[float]]:
     """Returns (mean depth as colours, [nearest, farthest] in scene units); distances by their inverse."""
-    seen = alpha > SEEN
-    if not seen.any():
+    covered = alpha > COVERED
+    if not covered.any():
         return torch.zeros(3, *alpha.shape), []
     inverse = alpha / summed.clamp(min=1e-12)
-    values = inverse[seen][:: max(1, int(seen.sum()) // ENOUGH)]
+    values = inverse[covered][:: max(1, int(covered.sum()) // ENOUGH)]
     far, near = values.quantile(torch.tensor([INNER, 1 - INNER])).tolist()
     shade = (inverse - far) / max(near - far, 1e-12)
-    picture = torch.where(seen, colour_ramp(0.1 + 0.9 * shade.clamp(0, 1)), 0)
+    picture = torch.where(covered, colour_ramp(0.1 + 0.9 * shade.clamp(0, 1)), 0)
     return picture, [1 / near, 1 / far]
 
 

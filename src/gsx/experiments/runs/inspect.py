@@ -57,7 +57,7 @@ def describe(path: str | Path, plugins: Plugins, patient: bool = False) -> list[
 
     patient: loads what takes minutes, too. Never raises.
     """
-    path, found = at_home(path), Findings()
+    path, findings = at_home(path), Findings()
     loaders: Readable = []
 
     def formats() -> Iterator[str]:
@@ -67,14 +67,14 @@ def describe(path: str | Path, plugins: Plugins, patient: bool = False) -> list[
         if others:
             yield f"also      readable as scene={' or scene='.join(other.name for other, _ in others)}"
 
-    found.add(formats())
+    findings.add(formats())
     if loaders:
         loader, its = loaders[0]
-        found.command = training_command(loader, path, {})
-        found.add(scene_lines(loader, its, path, found, plugins, patient))
-    problems = [f"problem   {problem}" for problem in found.problems]
+        findings.command = training_command(loader, path, {})
+        findings.add(scene_lines(loader, its, path, findings, plugins, patient))
+    problems = [f"problem   {problem}" for problem in findings.problems]
     label = "then" if problems else "train"
-    return [*found.lines, *problems, *([f"{label:10}{found.command}"] if found.command else [])]
+    return [*findings.lines, *problems, *([f"{label:10}{findings.command}"] if findings.command else [])]
 
 
 def scene_loaders(path: Path, plugins: Plugins) -> Readable:
@@ -93,14 +93,14 @@ def scene_loaders(path: Path, plugins: Plugins) -> Readable:
 
 def readable(path: Path, plugins: Plugins) -> Readable:
     """Returns the loaders that can read a folder, the most specific first; logs one that fails."""
-    found: Readable = []
+    loaders: Readable = []
     for loader, its in plugins.registry.formats():
         try:
             if its.recognise(path):
-                found.append((loader, its))
+                loaders.append((loader, its))
         except Exception as error:  # a plugin's; others may read it
             logger.warning("scene=%s cannot look at %s (%s: %s)", loader.name, path, type(error).__name__, error)
-    return found
+    return loaders
 
 
 def refuse_run(path: Path) -> None:
@@ -136,17 +136,17 @@ def unknown(path: Path, plugins: Plugins) -> InputError:
 
 
 def scene_lines(
-    loader: Component, its: SceneFormat, path: Path, found: Findings, plugins: Plugins, patient: bool
+    loader: Component, its: SceneFormat, path: Path, findings: Findings, plugins: Plugins, patient: bool
 ) -> Iterator[str]:
     """Yields what lies in the folder, and what the loader makes of it."""
     yield from its.facts(path)
     overrides = its.overrides(path)
-    found.command = training_command(loader, path, overrides)
+    findings.command = training_command(loader, path, overrides)
     if its.quick or patient:
         loaded = loader.factory(options_for(loader, path, overrides, plugins))
         scene = measured(around_origin(loaded, origin_of(loaded)))
         yield from loaded_lines(scene)
-        found.add(capture_lines(scene))
+        findings.add(capture_lines(scene))
     else:
         yield f"poses     not known yet: {command('scenes', path, '--poses')} finds them and judges the coverage"
 

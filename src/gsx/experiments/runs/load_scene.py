@@ -74,21 +74,23 @@ def checked(scene: Any, loader: str) -> Scene:
         raise InputError(
             f"scene={loader} returned {type(scene).__name__}: a loader returns a gsx.core.data.scene.Scene"
         )
-    named, told = {view.name: view.camera for view in scene.train}, f"scene={loader} returned a scene"
+    named, source = {view.name: view.camera for view in scene.train}, f"scene={loader} returned a scene"
     odd = [view.name for view in [*scene.train, *scene.test] if not finite(view.camera)]
     both = [view.name for view in scene.test if view.name in named and view.camera.has_pose_of(named[view.name])]
     if not scene.train:
-        raise InputError(f"{told} without training views: check the folder, or scene.split")
+        raise InputError(f"{source} without training views: check the folder, or scene.split")
     if odd:
         raise InputError(
-            f"{told} whose camera of '{odd[0]}' holds a value that is not finite: correct it, or leave it out"
+            f"{source} whose camera of '{odd[0]}' holds a value that is not finite: correct it, or leave it out"
         )
     if both:
-        raise InputError(f"{told} with '{both[0]}' to train on and to test on: a view is one or the other")
+        raise InputError(f"{source} with '{both[0]}' to train on and to test on: a view is one or the other")
     if not bool(torch.isfinite(scene.points.positions).all()):
-        raise InputError(f"{told} with points that are not finite: leave them out")
+        raise InputError(f"{source} with points that are not finite: leave them out")
     if scene.background.shape != (3,) or not bool(((scene.background >= 0) & (scene.background <= 1)).all()):
-        raise InputError(f"{told} whose background is {scene.background.tolist()}: give red, green and blue in [0, 1]")
+        raise InputError(
+            f"{source} with a background of {scene.background.tolist()}: give red, green and blue in [0, 1]"
+        )
     return scene
 
 
@@ -105,8 +107,8 @@ def count_notes(settings: Settings) -> list[str]:
     if not (published and path):
         return []
     images = getattr(settings.scene.options, "images", "") or "images"
-    found, compared = file_count(at_home(path) / images), "figures cannot be compared with published ones"
-    return [] if found == published else [f"{images}/ holds {found} files, published are {published}: {compared}."]
+    count, compared = file_count(at_home(path) / images), "figures cannot be compared with published ones"
+    return [] if count == published else [f"{images}/ holds {count} files, published are {published}: {compared}."]
 
 
 def with_more_points(scene: Scene, count: int, seed: int) -> Scene:

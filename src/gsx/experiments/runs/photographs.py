@@ -60,15 +60,15 @@ def findings_of(run: Run, pixels: int) -> list[Finding]:
     """Returns findings on every training photograph, worst first."""
     views = different(run.train_views)
     progress, known = Countdown("looking at photographs", len(views)), sharpness_of(run.scene.train)
-    found = []
+    findings = []
     for view in views:
-        found.append(finding(run, view, known.get(view.name), pixels))
+        findings.append(finding(run, view, known.get(view.name), pixels))
         progress.advance(1, view.name)
     exposure, poses = run.modules.get("exposure"), run.modules.get("poses")
     when = "never" if exposure is None else exposure.options.when
-    remarks = remarks_on(found, when, is_active(exposure), is_active(poses))
+    remarks = remarks_on(findings, when, is_active(exposure), is_active(poses))
     return sorted(
-        (replace(one, remarks=said) for one, said in zip(found, remarks, strict=True)), key=lambda one: one.psnr
+        (replace(one, remarks=words) for one, words in zip(findings, remarks, strict=True)), key=lambda one: one.psnr
     )
 
 
@@ -85,21 +85,21 @@ def different(views: Sequence[View]) -> list[View]:
 def sharpness_of(views: Sequence[View]) -> dict[str, float]:
     """Returns sharpness against neighbours by the name of a view, of those that are photographs."""
     files = {view.name: view.source.path for view in views if isinstance(view.source, PhotoSource)}
-    found = sharpness(sorted(set(files.values())))
-    return {name: found[path] for name, path in files.items() if path in found}
+    ratios = sharpness(sorted(set(files.values())))
+    return {name: ratios[path] for name, path in files.items() if path in ratios}
 
 
 @torch.no_grad()
 def finding(run: Run, view: View, known_sharpness: float | None, pixels: int) -> Finding:
     """Compares one photograph with the render; without remarks."""
     own, photograph, counted = render(run, view.camera, pixels).image, view.image(), view.counted()
-    shown = at_exposure(run, view, own)
-    error = blacked(shown - photograph, counted).square().mean(0)
+    image = at_exposure(run, view, own)
+    error = blacked(image - photograph, counted).square().mean(0)
     return Finding(
         name=view.name,
-        psnr=psnr(shown, photograph, counted),
+        psnr=psnr(image, photograph, counted),
         gains=gains_of(own, photograph, counted),
-        shift=shift_of(shown, photograph, counted),
+        shift=shift_of(image, photograph, counted),
         concentrated=concentrated(error, counted),
         sharpness=known_sharpness,
         masked=0.0 if counted is None else 1 - float(counted.float().mean()),
@@ -117,9 +117,9 @@ def write_findings(run: Run, findings: Sequence[Finding], worst: int, pixels: in
     place = Pictures(run.folder / FOLDER, run.step)
     place.folder.mkdir(parents=True, exist_ok=True)
     forget(place.folder)
-    views, shown = {view.name: view for view in run.train_views}, findings[:worst]
+    views, pictured = {view.name: view for view in run.train_views}, findings[:worst]
     entries: list[dict[str, Any]] = [asdict(one) for one in findings]
-    for entry, name in zip(entries, file_names([one.name for one in shown]), strict=False):
+    for entry, name in zip(entries, file_names([one.name for one in pictured]), strict=False):
         view = views[entry["name"]]
         image = at_exposure(run, view, render(run, view.camera, pixels).image)
         entry["files"] = place.compared(name, view, image)

@@ -29,7 +29,9 @@ def write_pseudo_pictures(run: Run, options: EvalOptions) -> None:
         except (OSError, ValueError) as error:
             logger.warning("%s cannot be read (%s): its pseudo views are not shown", path, error)
             continue
-        entries += [shown(run, options, augmenter, view) for view in with_pictures(folder, augmenter, views)[:SHOWN]]
+        entries += [
+            picture_entry(run, options, augmenter, view) for view in with_pictures(folder, augmenter, views)[:SHOWN]
+        ]
     if entries:
         write_json(folder / "index.json", {"views": entries})
 
@@ -41,7 +43,7 @@ def with_pictures(folder: Path, augmenter: str, views: list[PseudoView]) -> list
     return [view for name, view in by_name.items() if (folder / name).is_file()]
 
 
-def shown(run: Run, options: EvalOptions, augmenter: str, view: PseudoView) -> dict[str, Any]:
+def picture_entry(run: Run, options: EvalOptions, augmenter: str, view: PseudoView) -> dict[str, Any]:
     """Renders one of them; returns its entry in the index."""
     after = render(run, view.camera, options.tile_pixels).image
     made = picture_name(augmenter, view)

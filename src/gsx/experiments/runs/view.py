@@ -29,9 +29,9 @@ class Watched:
 
     def __init__(self, folder: Path, plugins: Plugins) -> None:
         self.run, self.settings = open_run(folder, plugins)
-        asked = self.run.raster
-        self.run.raster = replace(asked, path="eager")  # the first pictures come at once
-        self.compiling = compile_beside(asked, self.run.device, self.faster)
+        raster = self.run.raster
+        self.run.raster = replace(raster, path="eager")  # the first pictures come at once
+        self.compiling = compile_beside(raster, self.run.device, self.faster)
         self.looked = time.monotonic()
 
     def refresh(self) -> bool:
@@ -53,7 +53,7 @@ class Watched:
         """Draws by these rules from now on."""
         self.run.raster = raster
 
-    def told(self) -> str:
+    def state(self) -> str:
         """Returns the state of the run in words."""
         return f"{told_of(self.run)}, {state_of(read_run(self.run.folder))[0]}"
 
@@ -66,10 +66,10 @@ def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Cal
     """
     watched = Watched(folder, plugins)
     viewer = Viewer(RunModel(watched.run), f"{watched.run.scene.name}, {folder.name}", host, port)
-    viewer.tell(watched.told())
+    viewer.tell(watched.state())
     announce(viewer.address)
     try:
-        viewer.serve(lambda: False, lambda: viewer.changed(watched.told()) if watched.refresh() else None)
+        viewer.serve(lambda: False, lambda: viewer.changed(watched.state()) if watched.refresh() else None)
     finally:
         viewer.stop()
 
