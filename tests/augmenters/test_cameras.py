@@ -19,7 +19,7 @@ from gsx.augmenters.cameras import (
     window_size,
     worst_window,
 )
-from gsx.augmenters.planner import Planner
+from gsx.augmenters.planner import Planner, Slot
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.window import Window
 from gsx.core.gaussians.splats import Splats
@@ -146,7 +146,7 @@ def test_windows_of_all_events_cover_the_raster(variants: int, variant: int) -> 
             (placed.left, placed.top)
             for event in planner.events
             for one in own
-            for placed in [planner.placed(run, parent, pose, (32, 24), event, one, generator)]
+            for placed in [planner.window_in(run, Slot(event, parent, 2, one), pose, (32, 24), generator)]
         }
         assert found == {(0, 0), (32, 0), (0, 24), (32, 24)}
 

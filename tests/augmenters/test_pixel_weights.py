@@ -8,7 +8,6 @@ import torch
 from gsx.augmenters.pixel_weights import (
     agreeing,
     best_densities,
-    densities,
     in_bytes,
     normalised,
     sampled_better,
@@ -30,7 +29,7 @@ def at(distance: float, width: int = 40, target: float = 0.0) -> Camera:
 def test_densities_are_pixels_per_unit() -> None:
     points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [9.0, 0.0, 0.0], [0.0, -9.0, 0.0]])
     camera = at(4.0)
-    found = densities(points, camera)
+    found = best_densities(points, [camera])
     assert found.tolist() == pytest.approx([camera.fx / 4, camera.fx / 6, 0.0, 0.0])
     assert float(best_densities(points, [camera, at(2.0)])[0]) == pytest.approx(camera.fx / 2)
 

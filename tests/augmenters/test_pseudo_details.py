@@ -11,6 +11,7 @@ from regenerating import of_role
 from tiny import final_tensors, stopped_at, tiny_run, tiny_settings
 from torch import Tensor
 
+from gsx.augmenters.planner import Slot
 from gsx.augmenters.pseudo_details import PseudoDetails
 from gsx.augmenters.store import load_views, save_views
 from gsx.builtin import plugins
@@ -174,8 +175,9 @@ def test_freezing_for_half_of_a_window(tmp_path: Path) -> None:
     run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper")
     half = by_options(run, freeze_shared="half")
     view = PseudoView(camera=run.scene.train[0].camera, target=torch.zeros(3, 36, 48, dtype=torch.uint8), parent=0)
-    found = [half.weighted(run, [view], 0.0, place) for place in (0.0, 0.49, 0.5, 1.0)]
-    assert [term is not None and term.shared for term in found] == [False, False, True, True]
+    half.views = {0: [view]}
+    terms = [half.weighted(run, 0, 0.0, place) for place in (0.0, 0.49, 0.5, 1.0)]
+    assert [term.shared for term in terms] == [False, False, True, True]
 
 
 def test_trust_weighs_pixels() -> None:
@@ -254,8 +256,9 @@ def test_means_over_cameras_or_over_scales(tmp_path: Path) -> None:
     term = augmenter_of(run).term(run, 45, 0)
     assert term is not None
     assert [weight for _, weight in term.parts] == pytest.approx([1 / 6] * 6)
-    term = by_options(run, reduce="per_scale").weighted(run, [view for view, _ in term.parts], 0.0, 0.0)
-    assert term is not None
+    per_scale = by_options(run, reduce="per_scale")
+    per_scale.views = {0: [view for view, _ in term.parts]}
+    term = per_scale.weighted(run, 0, 0.0, 0.0)
     assert [weight for _, weight in term.parts] == pytest.approx([1 / 2] * 6)
 
 
@@ -389,7 +392,7 @@ def test_zoomed_cameras_see_finer_levels(tmp_path: Path) -> None:
     spot = (own.centre + distance * own.rotation[2]).float()
     table.columns["anchors"] = spot.expand(len(table), 3).clone()
     table.columns["level"] = (torch.arange(len(table)) % 6).to(torch.int16)
-    cameras = [own, *(augmenter_of(run).planner.spec(run, 44, 0, scale, 0).camera for scale in (2, 4))]
+    cameras = [own, *(augmenter_of(run).planner.spec(run, Slot(44, 0, scale, 0)).camera for scale in (2, 4))]
     drawn = [table["level"][backbone.visible(camera, 80).rows].unique().tolist() for camera in cameras]  # type: ignore[attr-defined]
     assert drawn == [[0, 1], [0, 1, 2], [0, 1, 2, 3]]
 
@@ -455,8 +458,8 @@ def test_windows_that_show_little_are_drawn_again(tmp_path: Path) -> None:
             kept = table["opacity_logits"].detach().clone()
             table["opacity_logits"].data.copy_(torch.where(places[:, :1] > 16, -30.0, 0.0).view_as(kept))
             augmenter = by_options(run, least_alpha=wanted)
-            spec = augmenter.planner.spec(run, 44, parent, 4, 0)
-            alphas.append(float(render(run, spec.inside.of(spec.seen)).alpha.mean()))
+            spec = augmenter.planner.spec(run, Slot(44, parent, 4, 0))
+            alphas.append(float(render(run, spec.inside.of(spec.source)).alpha.mean()))
             table["opacity_logits"].data.copy_(kept)
         least[wanted] = min(alphas)
     assert least[0.0] < 0.5

@@ -79,19 +79,14 @@ def blended(values: Float[Tensor, "N"], splats: Splats, camera: Camera, raster: 
     return rasterize(counted, camera, raster).image[0]
 
 
-def densities(points: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N"]:
-    """Pixels per scene unit at each point, facing the camera; 0 where it does not see the point."""
-    places, depth = camera.project(points)
-    inside = ((places >= 0) & (places < places.new_tensor([camera.width, camera.height]))).all(1)
-    seen = (depth > camera.near) & inside
-    return torch.where(seen, camera.fx / depth.clamp_min(camera.near), 0.0)
-
-
 def best_densities(points: Float[Tensor, "N 3"], cameras: Sequence[Camera]) -> Float[Tensor, "N"]:
-    """The most that any of the cameras has."""
+    """Returns the most pixels per scene unit that any camera has at each point; 0 where none sees it."""
     best = torch.zeros_like(points[:, 0])
     for camera in cameras:
-        best = best.maximum(densities(points, camera))
+        places, depth = camera.project(points)
+        inside = ((places >= 0) & (places < places.new_tensor([camera.width, camera.height]))).all(1)
+        visible = (depth > camera.near) & inside
+        best = best.maximum(torch.where(visible, camera.fx / depth.clamp_min(camera.near), 0.0))
     return best
 
 

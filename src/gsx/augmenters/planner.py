@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 
@@ -15,25 +16,35 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run
 
 MOST_TRIES = 10
-"""Times that a place is drawn for a window until it shows enough of the scene (the paper, Cropped Upscaling)."""
+"""Most draws of a window until enough of the scene is in it (the paper, Cropped Upscaling)."""
+
+
+class Slot(NamedTuple):
+    """Place of a pseudo view in an event."""
+
+    event: int
+    parent: int
+    scale: int
+    variant: int
+    """0: the training camera itself; others are moved at random."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PseudoViewSpec:
-    """A pseudo view before its picture is drawn."""
+    """A pseudo view before its picture is redrawn."""
 
     parent: int
     scale: int
     kind: str
     """base or random."""
-    seen: Camera
-    """What is redrawn, with context around it."""
+    source: Camera
+    """Camera of what is redrawn, with context around it."""
     inside: Window
-    """Of `seen`: what is kept."""
+    """Part of the source that is kept."""
     outer: Window | None
-    """Of the photograph, where `seen` is cut from it; None: it is rendered."""
+    """Part of the photograph that the source is; None: it is rendered."""
     camera: Camera
-    """Of the result."""
+    """Camera of the result."""
     seed: int
 
 
@@ -50,74 +61,65 @@ class Planner:
     """Steps at which pseudo views are made."""
 
     def specs(self, run: Run, event: int, parents: Set[int]) -> Iterator[PseudoViewSpec]:
-        """Cameras of an event beside some training views, in the order of these, base before random."""
+        """Plans the pseudo views of some training views at an event, in their order, base before random."""
         options = self.options
         for parent in sorted(parents):
             if options.first_cameras and parent >= options.first_cameras:
                 continue
             for scale in self.scales_of(event):
                 variants = range(0 if options.base else 1, options.variants + 1)
-                yield from (self.spec(run, event, parent, scale, variant) for variant in variants)
+                yield from (self.spec(run, Slot(event, parent, scale, variant)) for variant in variants)
 
     def scales_of(self, event: int) -> list[int]:
-        """All of them, or the one whose turn it is."""
+        """Returns all scales, or the one whose turn it is."""
         scales = list(self.options.scales)
         if not self.options.progressive:
             return scales
         return [scales[self.events.index(event) * len(scales) // len(self.events)]]
 
-    def spec(self, run: Run, event: int, parent: int, scale: int, variant: int) -> PseudoViewSpec:
-        """One camera; variant 0 is the training camera's own."""
-        options, own = self.options, run.train_views[parent].camera
-        generator = torch.Generator().manual_seed(derived_seed(self.seed, self.name, event, parent, scale, variant))
+    def spec(self, run: Run, slot: Slot) -> PseudoViewSpec:
+        """Plans one pseudo view."""
+        options, camera, scale = self.options, run.train_views[slot.parent].camera, slot.scale
+        generator = torch.Generator().manual_seed(derived_seed(self.seed, self.name, *slot))
         zoom = scale if options.zoom == "intrinsics" else 1
-        size = window_size(own.width, own.height, options.narrow, zoom)
-        pose, window = self.looking(run, event, parent, scale, variant, size, generator)
-        outer = window.grown(options.context, own.width, own.height)
+        size = window_size(camera.width, camera.height, options.narrow, zoom)
+        pose, window = self.pose_and_window(run, slot, size, generator)
+        outer = window.grown(options.context, camera.width, camera.height)
         inside = Window(
             left=window.left - outer.left, top=window.top - outer.top, width=window.width, height=window.height
         )
-        result = window.of(pose)
-        seen = outer.of(pose)
+        result, source = window.of(pose), outer.of(pose)
         if zoom > 1:
             result = result.zoom(zoom)
         elif scale > 1:  # the other reading: fewer pixels are redrawn to as many
-            inside, seen, result = reduced(window, pose, scale)
+            inside, source, result = reduced(window, pose, scale)
+        photo = slot.variant == 0 and options.base_source == "photo" and (zoom > 1 or scale == 1)
         return PseudoViewSpec(
-            parent=parent,
+            parent=slot.parent,
             scale=scale,
-            kind="base" if variant == 0 else "random",
-            seen=seen,
+            kind="random" if slot.variant else "base",
+            source=source,
             inside=inside,
-            outer=outer if variant == 0 and options.base_source == "photo" and (zoom > 1 or scale == 1) else None,
+            outer=outer if photo else None,
             camera=result,
-            seed=options.seed
-            if options.seeds == "fixed"
-            else derived_seed(self.seed, "noise", event, parent, scale, variant),
+            seed=options.seed if options.seeds == "fixed" else derived_seed(self.seed, "noise", *slot),
         )
 
-    def looking(
-        self,
-        run: Run,
-        event: int,
-        parent: int,
-        scale: int,
-        variant: int,
-        size: tuple[int, int],
-        generator: torch.Generator,
+    def pose_and_window(
+        self, run: Run, slot: Slot, size: tuple[int, int], generator: torch.Generator
     ) -> tuple[Camera, Window]:
-        """(camera, window) of a pseudo view; of those drawn at random the first that shows enough of the scene."""
-        own, options = run.train_views[parent].camera, self.options
-        checked = options.least_alpha > 0 and (variant > 0 or (options.window == "random" and size != own.size))
+        """Draws the pose and window of a pseudo view; at random until enough of the scene is in it."""
+        camera, options = run.train_views[slot.parent].camera, self.options
+        checked = options.least_alpha > 0 and (slot.variant > 0 or (options.window == "random" and size != camera.size))
         for _ in range(MOST_TRIES if checked else 1):
-            pose = own if variant == 0 else self.beside(own, scale, generator)
-            window = self.placed(run, parent, pose, size, event, variant, generator)
+            pose = camera if slot.variant == 0 else self.perturbed(camera, slot.scale, generator)
+            window = self.window_in(run, slot, pose, size, generator)
             if not checked or float(render(run, window.of(pose)).alpha.mean()) >= options.least_alpha:
                 break
         return pose, window
 
-    def beside(self, camera: Camera, scale: int, generator: torch.Generator) -> Camera:
-        """A camera near a training camera."""
+    def perturbed(self, camera: Camera, scale: int, generator: torch.Generator) -> Camera:
+        """Moves a training camera at random."""
         options = self.options
         turn = options.rotation_noise
         if options.relative_noise:
@@ -130,33 +132,26 @@ class Planner:
             options.kept,
         )
 
-    def placed(
-        self,
-        run: Run,
-        parent: int,
-        pose: Camera,
-        size: tuple[int, int],
-        event: int,
-        variant: int,
-        generator: torch.Generator,
+    def window_in(
+        self, run: Run, slot: Slot, pose: Camera, size: tuple[int, int], generator: torch.Generator
     ) -> Window:
-        """Where the window lies on the raster (the paper, Cropped Upscaling)."""
+        """Places the window on the raster (the paper, Cropped Upscaling)."""
         width, height = pose.size
-        kind = self.options.window
+        kind, variant = self.options.window, slot.variant
         if kind == "random" or (kind == "error" and variant > 0):
             return random_window(width, height, size, generator)
         if kind == "grid":
             each, place = (1, 0) if variant == 0 else (self.options.variants, variant - 1)
-            return grid_window(width, height, size, self.events.index(event) * each + place + parent)
+            return grid_window(width, height, size, self.events.index(slot.event) * each + place + slot.parent)
         if kind == "error":
-            view = run.train_views[parent]
+            view = run.train_views[slot.parent]
             error = blacked(render(run, pose).image - view.image(), view.counted())
             return worst_window(error.abs().mean(0), size)
         return centred_window(width, height, size)
 
 
 def reduced(window: Window, pose: Camera, scale: int) -> tuple[Window, Camera, Camera]:
-    """(all of it, camera of 1/scale the density, camera of the result) for a window whose sides are made divisible."""
+    """Returns (whole window, camera of 1/scale the density, camera of the result), with divisible sides."""
     width, height = max(1, window.width // scale), max(1, window.height // scale)
     whole = Window(left=window.left, top=window.top, width=width * scale, height=height * scale).of(pose)
     return Window(left=0, top=0, width=width, height=height), whole.resize(width, height), whole

@@ -165,7 +165,7 @@ class PseudoDetails(Redrawing):
             told = ", ".join(f"{name} {value:.3g}" for name, value in learnt.items())
             logger.info("%s, regenerator at step %d: %s", self.context.name, event, told)
         specs = list(self.planner.specs(run, event, parents))
-        views = self.redrawer.all_drawn(run, event, specs)
+        views = self.redrawer.redraw_all(run, event, specs)
         views += [
             self.redrawer.coarser_view(run, event, parent, factor)
             for parent in sorted({spec.parent for spec in specs})

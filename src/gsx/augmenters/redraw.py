@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,56 +36,60 @@ logger = logging.getLogger(__name__)
 
 BATCH = 64
 """Pictures redrawn between two lines of progress."""
-SHOWN = 3
-"""Training views of an event whose pictures are kept to be looked at."""
+PICTURED = 3
+"""Training views of an event whose pictures are kept for people."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Redrawer:
-    """Asks a regenerator for the pictures of pseudo views, and weighs those that stood up to the checks."""
+    """Has a regenerator redraw the pictures of pseudo views, and weighs those that pass the checks."""
 
     name: str
     options: PseudoOptions
     regenerator: CheckedRegenerator
     schedule: Schedule
 
-    def all_drawn(self, run: Run, event: int, specs: Sequence[PseudoViewSpec]) -> list[PseudoView]:
-        """The pseudo views of what was planned, but for those whose pictures are dropped; told batch by batch."""
+    def redraw_all(self, run: Run, event: int, specs: Sequence[PseudoViewSpec]) -> list[PseudoView]:
+        """Makes the planned pseudo views, without those whose pictures are dropped, and logs each batch."""
         views: list[PseudoView] = []
-        shown = sorted({spec.parent for spec in specs})[:SHOWN]
+        pictured = sorted({spec.parent for spec in specs})[:PICTURED]
         for first in range(0, len(specs), BATCH):
             batch = specs[first : first + BATCH]
-            views += self.drawn(run, event, batch, shown)
+            views += self.redraw_batch(run, event, batch, pictured)
             logger.info("%s at step %d: %d of %d pictures", self.name, event, first + len(batch), len(specs))
         return views
 
-    def drawn(self, run: Run, event: int, specs: Sequence[PseudoViewSpec], shown: Sequence[int]) -> list[PseudoView]:
-        """The pseudo views of some plans; pictures of the training views `shown` are kept to be looked at."""
-        options, views = self.options, []
+    def redraw_batch(
+        self, run: Run, event: int, specs: Sequence[PseudoViewSpec], pictured: Sequence[int]
+    ) -> list[PseudoView]:
+        """Makes some pseudo views, and writes pictures of those of the training views `pictured`."""
+        views = []
         requests = [self.request(run, event, spec) for spec in specs]
         run.refuse_if_stopping()
+        options = self.options
         redrawn = self.regenerator.redraw(requests, samples=options.samples, project=options.project == "exact")
         for spec, request, one in zip(specs, requests, redrawn, strict=True):
             if one.image is not None:
                 view = self.view(run, event, spec, request, one.image)
                 views.append(view)
-                if spec.parent in shown:
-                    self.show(run.folder / "pseudo", spec, request, view)
+                if spec.parent in pictured:
+                    self.write_comparison(run.folder / "pseudo", spec, request, view)
         return views
 
     def request(self, run: Run, event: int, spec: PseudoViewSpec) -> Request:
-        """What the regenerator is asked for."""
+        """Describes a picture to the regenerator."""
         run.refuse_if_stopping()
         view = run.train_views[spec.parent]
-        image = render(run, spec.seen).image if spec.outer is None else photographed(run, view, spec.outer, spec.seen)
+        outer = spec.outer
+        image = render(run, spec.source).image if outer is None else photo_window(run, view, outer, spec.source)
         return Request(
             image=image,
             scale=spec.scale,
             reduction=run.scene.reduction,
-            camera=spec.seen,
+            camera=spec.source,
             view=view,
             number=spec.parent,
-            photo=spec.outer is not None,
+            photo=outer is not None,
             seed=spec.seed,
             strength=ramp(self.options.strength, event, self.options.timing, self.schedule),
             strongest=max(self.options.strength),
@@ -95,18 +100,19 @@ class Redrawer:
     def view(
         self, run: Run, event: int, spec: PseudoViewSpec, request: Request, result: Float[Tensor, "3 H W"]
     ) -> PseudoView:
-        """The pseudo view of a result: its window, in 8 bits."""
-        a, inside = spec.scale, spec.inside
-        target = to_uint8(result.clamp(0, 1))
-        if self.options.project == "exact" and a > 1 and request.photo:
-            target = exactly_consistent(result, to_uint8(request.image), a, request.reduction)
+        """Makes the pseudo view of a result: its window, in 8 bits."""
+        a, inside, reduction = spec.scale, spec.inside, request.reduction
+        enlarged = request.photo and a > 1
+        target, low = to_uint8(result.clamp(0, 1)), to_uint8(request.image)
+        if self.options.project == "exact" and enlarged:
+            target = exactly_consistent(result, low, a, reduction)
         window = Window(left=a * inside.left, top=a * inside.top, width=a * inside.width, height=a * inside.height)
         kept = window.cut(target).contiguous()
         shares = {}
-        if request.photo and a > 1:
-            same = consistent_pixels(target, to_uint8(request.image), a, request.reduction)
+        if enlarged:
+            same = consistent_pixels(target, low, a, reduction)
             shares = {"consistent": float(inside.cut(same[None].float()).mean())}
-        known = request.photo and a > 1 and self.options.coarse_weight > 0
+        known = enlarged and self.options.coarse_weight > 0
         return PseudoView(
             camera=spec.camera,
             target=kept,
@@ -114,72 +120,75 @@ class Redrawer:
             pixel_weight=self.pixel_weight(run, spec, request, target.float() / 255, window),
             coarse=to_uint8(inside.cut(request.image)).contiguous() if known else None,
             coarse_weight=self.options.coarse_weight if known else 0.0,
-            reduction=request.reduction,
-            provenance={
-                "event": event,
-                "made_after_step": run.step,
-                "view": request.view.name,
-                "kind": spec.kind,
-                "scale": a,
-                "source": "photo" if request.photo else "render",
-                "seed": request.seed,
-                "strength": request.strength,
-                **shares,
-                "sha256": hashlib.sha256(kept.numpy().tobytes()).hexdigest(),
-            },
-        )
+            reduction=reduction,
+            provenance=provenance(
+                run, event, request.view, kept, spec.kind, a, request.photo,
+                seed=request.seed, strength=request.strength, **shares,
+            ),
+        )  # fmt: skip
 
     def coarser_view(self, run: Run, event: int, parent: int, factor: int) -> PseudoView:
-        """The training camera at a fraction of its size, without what fills no block at the right and below."""
+        """Makes the pseudo view of a training camera at a fraction of its size, without partial blocks at the rim."""
         run.refuse_if_stopping()
         view = run.train_views[parent]
         width, height = view.camera.size
         whole = Window(left=0, top=0, width=width, height=height)
         _, camera, covered = reduced(whole, view.camera, factor)
         photo = self.options.base_source == "photo"
-        picture = photographed(run, view, whole, view.camera) if photo else render(run, view.camera).image
+        picture = photo_window(run, view, whole, view.camera) if photo else render(run, view.camera).image
         reduction = run.scene.reduction if photo else Reduction()  # Mipmap-GS: bilinear, which is the mean of four
         target = to_uint8(reduction.reduce(Window(0, 0, *covered.size).cut(picture), factor))
-        return PseudoView(
-            camera=camera,
-            target=target,
-            parent=parent,
-            provenance={
-                "event": event,
-                "made_after_step": run.step,
-                "view": view.name,
-                "kind": "coarser",
-                "scale": 1 / factor,
-                "source": "photo" if photo else "render",
-                "sha256": hashlib.sha256(target.numpy().tobytes()).hexdigest(),
-            },
-        )
+        facts = provenance(run, event, view, target, "coarser", 1 / factor, photo)
+        return PseudoView(camera=camera, target=target, parent=parent, provenance=facts)
 
     def pixel_weight(
         self, run: Run, spec: PseudoViewSpec, request: Request, result: Float[Tensor, "3 H W"], window: Window
     ) -> UInt8[Tensor, "h w"] | None:
-        """How much each pixel of a window of the result counts; None where all count whole."""
+        """Weighs the pixels of a window of the result; None where all count whole."""
         options, pixel_weight = self.options, torch.ones(window.height, window.width)
         weights = WEIGHT_MAPS[options.weight_map]
         if weights is not None:
             photographs = [view.camera for view in run.train_views]
-            drawn = partial(splats_for, run)
-            pixel_weight = pixel_weight * weights(drawn, spec.camera, photographs, spec.parent, run.raster).cpu()
+            splats_of = partial(splats_for, run)
+            pixel_weight = pixel_weight * weights(splats_of, spec.camera, photographs, spec.parent, run.raster).cpu()
         if options.gate > 0 and request.photo and spec.scale > 1:
             agreed = agreeing(result, request.image, spec.scale, request.reduction, options.gate)
             pixel_weight = pixel_weight * window.cut(agreed[None])[0]
         return None if bool((pixel_weight == 1).all()) else in_bytes(pixel_weight)
 
-    def show(self, folder: Path, spec: PseudoViewSpec, request: Request, view: PseudoView) -> None:
-        """Keeps a picture to be looked at: what was redrawn, enlarged, the result, and their difference."""
-        given = as_blocks(spec.inside.cut(request.image), spec.scale)
+    def write_comparison(self, folder: Path, spec: PseudoViewSpec, request: Request, view: PseudoView) -> None:
+        """Writes a picture of what was redrawn, enlarged, the result, and their difference."""
+        source = as_blocks(spec.inside.cut(request.image), spec.scale)
         result = view.target.float() / 255
-        difference = (0.5 + 4 * (result - given)).clamp(0, 1)
+        difference = (0.5 + 4 * (result - source)).clamp(0, 1)
         folder.mkdir(parents=True, exist_ok=True)
-        write_image(folder / picture_name(self.name, view), torch.cat([given, result, difference], 2))
+        write_image(folder / picture_name(self.name, view), torch.cat([source, result, difference], 2))
 
 
-def photographed(run: Run, view: View, window: Window, camera: Camera) -> Float[Tensor, "3 h w"]:
-    """A window of a photograph, `camera` its own; where that does not count the render stands in."""
+def provenance(
+    run: Run,
+    event: int,
+    view: View,
+    target: UInt8[Tensor, "3 h w"],
+    kind: str,
+    scale: float,
+    photo: bool,
+    **more: float,
+) -> dict[str, Any]:
+    """Describes where a pseudo view comes from."""
+    return {
+        "event": event,
+        "made_after_step": run.step,
+        "view": view.name,
+        "kind": kind,
+        "scale": scale,
+        "source": "photo" if photo else "render",
+        **more,
+        "sha256": hashlib.sha256(target.numpy().tobytes()).hexdigest(),
+    }
+
+
+def photo_window(run: Run, view: View, window: Window, camera: Camera) -> Float[Tensor, "3 h w"]:
+    """Cuts a window out of a photograph; a render by the window's camera stands in for masked pixels."""
     photo, counted = window.cut(view.image()), view.counted()
     return photo if counted is None else where_counted(photo, render(run, camera).image.cpu(), counted[window.pixels])
