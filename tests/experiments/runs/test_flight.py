@@ -56,7 +56,9 @@ def test_depth_is_that_of_the_rasterizer_without_what_stands_behind_the_scene(mo
         colours=torch.cat([splats.colours, torch.ones(1, 3)]),
     )
     monkeypatch.setattr(drawing, "splats_for", lambda run, camera: with_sky)
-    run = SimpleNamespace(raster=rules, scene=small_scene(splats.means))
+    last = len(splats.means)
+    monkeypatch.setattr(drawing, "behind_scene", lambda backbone, means: torch.arange(len(means)) == last)
+    run = SimpleNamespace(raster=rules, scene=small_scene(splats.means), backbone=None)
     depth, coverage = drawing.depth_and_coverage(run, camera, 1 << 20)
     drawn = rasterize(splats, camera, rules, depth=True)
     torch.testing.assert_close(depth, drawn.depth, rtol=1e-5, atol=1e-5)
