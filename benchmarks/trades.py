@@ -133,7 +133,7 @@ def trained(scene: str, name: str, words: Sequence[str], given: argparse.Namespa
     """Evaluations of a setting by seed; none where the setting does not suit the scene."""
     where = [] if scene == "demo" else [f"scene.path={given.scenes / scene}"]
     threads = {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}
-    out = []
+    out = list[Evaluation]()
     for seed in given.seeds:
         folder = given.runs / scene / f"{name.replace(',', '').replace(' ', '_')}_{seed}"
         zooms = f"eval.zoom=[{','.join(ZOOMS)}]"

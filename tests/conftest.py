@@ -38,7 +38,6 @@ def pytest_terminal_summary(terminalreporter, config: pytest.Config) -> None:
 
 
 COMPILED = {
-    *(f"gsx.core.rasterizer.{name}" for name in ("kernels", "segment_kernels", "pixel_windows")),
     *(f"gsx.core.rasterizer.{name}" for name in ("geometry", "selection", "boxes")),
     *("gsx.core.gaussians.bands", "gsx.core.quality.similarity", "gsx.engine.compiling"),
 }

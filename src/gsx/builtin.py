@@ -43,21 +43,10 @@ def add_backbones(registry: Registry) -> None:
 
 def add_modules(registry: Registry) -> None:
     """Schedules, stopping rules and corrections of photos, in the order in which a run has them."""
-    from gsx.modules.blur import Blur, BlurOptions
-    from gsx.modules.coarse_to_fine import CoarseToFine, CoarseToFineOptions
-    from gsx.modules.distractors import DistractorOptions, Distractors
-    from gsx.modules.exposure import Exposure, ExposureOptions
-    from gsx.modules.plateau import Plateau, PlateauOptions
-    from gsx.modules.poses import PoseOptions, Poses
-    from gsx.modules.supersampling import Supersampling, SupersamplingOptions
+    from gsx.modules.catalogue import MODULES
 
-    registry.add("module", "coarse_to_fine", CoarseToFine, CoarseToFineOptions)
-    registry.add("module", "supersampling", Supersampling, SupersamplingOptions)
-    registry.add("module", "plateau", Plateau, PlateauOptions)
-    registry.add("module", "poses", Poses, PoseOptions)
-    registry.add("module", "exposure", Exposure, ExposureOptions)
-    registry.add("module", "blur", Blur, BlurOptions)
-    registry.add("module", "distractors", Distractors, DistractorOptions)
+    for name, (factory, options) in MODULES.items():
+        registry.add("module", name, factory, options)
 
 
 def add_augmenters(registry: Registry) -> None:

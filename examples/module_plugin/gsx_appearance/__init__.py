@@ -36,11 +36,13 @@ class Appearance(LearnedModule):
         matrix = torch.eye(3, 4, device=code.device) + code.view(3, 4)
         return transform_colours(image.to(code.device), matrix if learning else matrix.detach())
 
-    def summary(self, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    @classmethod
+    def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         spreads = [line["appearance"] for line in lines if "appearance" in line]
         return {"appearance": {"spread": spreads[-1]}} if spreads else {}
 
-    def remarks(self, evaluation: Mapping[str, Any]) -> Iterator[str]:
+    @classmethod
+    def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
         if "appearance" in evaluation:
             yield f"appearance codes of photos have a spread of {evaluation['appearance']['spread']:.3f}"
 

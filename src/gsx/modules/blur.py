@@ -138,16 +138,18 @@ class Blur(Correction):
         self.movements = {name.removeprefix("of "): tuple(tensors[name].tolist()) for name in names}
         self.last_estimate = int(tensors["asked"]) if tensors else 0
 
-    def summary(self, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    @classmethod
+    def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """Returns when movements were estimated first, and of how many photos at last."""
-        held = [line for line in lines if self.seconds_key in line]
+        held = [line for line in lines if cls.seconds_key in line]
         if not held:
             return {}
         figures = {"step": held[0]["step"], "blurred": held[-1]["blurred"], "asked": held[-1]["blur_suspects"]}
-        figures |= {"length": held[-1].get("blur_length", 0.0), "seconds": sum(line[self.seconds_key] for line in held)}
+        figures |= {"length": held[-1].get("blur_length", 0.0), "seconds": sum(line[cls.seconds_key] for line in held)}
         return {"blur": figures}
 
-    def remarks(self, evaluation: Mapping[str, Any]) -> Iterator[str]:
+    @classmethod
+    def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
         """Yields that photos are blurred."""
         figures = evaluation.get("blur") or {}
         if figures.get("blurred"):

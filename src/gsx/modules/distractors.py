@@ -121,21 +121,23 @@ class Distractors(Correction):
         masks = [tensors[str(index)].clone() for index in range(len(tensors) - 1)] if tensors else None
         self.mask(masks, int(tensors["looked"]) if tensors else 0)
 
-    def summary(self, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    @classmethod
+    def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """Returns when photos were tested, the share that the test found, and the masked shares since.
 
         A stop before the step was taken loses its line.
         """
-        held = [line for line in lines if self.seconds_key in line]
+        held = [line for line in lines if cls.seconds_key in line]
         if not held:
             return {}
         masked = [line["distractors"] for line in held] if any(line["distractors"] for line in held) else []
         shares = [line["distractor_share"] for line in held if "distractor_share" in line]
-        seconds = sum(line[self.seconds_key] for line in held)
+        seconds = sum(line[cls.seconds_key] for line in held)
         figures = {"step": held[0]["step"], "share": (shares or [None])[0], "marked": masked, "seconds": seconds}
         return {"distractors": figures}
 
-    def remarks(self, evaluation: Mapping[str, Any]) -> Iterator[str]:
+    @classmethod
+    def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
         """Yields that parts of training photos do not count."""
         figures = evaluation.get("distractors") or {}
         if figures.get("marked"):

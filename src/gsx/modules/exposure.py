@@ -290,19 +290,21 @@ class Exposure(Correction):
         if grids is not None:
             self.grid_moments = tensors["grid_moments"].to(self.context.device).clone()
 
-    def summary(self, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    @classmethod
+    def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """Returns when photos were tested, the spreads, how many are corrected, and the changes since."""
-        held = [line for line in lines if self.seconds_key in line]
+        held = [line for line in lines if cls.seconds_key in line]
         if not held:
             return {}
         first = held[0]
         figures = {"step": first["step"], "spread": first.get("exposure_spread"), "learnt": first["exposures"]}
         figures["motions"] = [line["exposure_motion"] for line in held if "exposure_motion" in line]
-        figures["seconds"] = sum(line[self.seconds_key] for line in held)
+        figures["seconds"] = sum(line[cls.seconds_key] for line in held)
         grids = {"within": first["light_spread"], "grids": first["grids"]} if "light_spread" in first else {}
         return {"exposures": figures | grids}
 
-    def remarks(self, evaluation: Mapping[str, Any]) -> Iterator[str]:
+    @classmethod
+    def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
         """Yields that photos have exposures, which the model has none of."""
         figures = evaluation.get("exposures") or {}
         if figures.get("learnt"):

@@ -171,16 +171,18 @@ class Poses(Correction):
         self.last_estimate = int(tensors["corrected"]) if tensors else 0
         self.error = float(tensors.get("error", math.nan))  # older checkpoints lack it
 
-    def summary(self, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    @classmethod
+    def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """Returns when poses were tested, the spread of shifts, how many are corrected, and the motions."""
-        held = [line for line in lines if self.seconds_key in line]
+        held = [line for line in lines if cls.seconds_key in line]
         if not held:
             return {}
         figures = {"step": held[0]["step"], "spread": held[0].get("pose_spread"), "corrected": held[0]["poses"]}
         figures["motions"] = [line["pose_motion"] for line in held if "pose_motion" in line]
-        return {"poses": figures | {"seconds": sum(line[self.seconds_key] for line in held)}}
+        return {"poses": figures | {"seconds": sum(line[cls.seconds_key] for line in held)}}
 
-    def remarks(self, evaluation: Mapping[str, Any]) -> Iterator[str]:
+    @classmethod
+    def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
         """Yields that training poses are corrected, and test poses are not."""
         figures = evaluation.get("poses") or {}
         if figures.get("corrected"):

@@ -112,11 +112,13 @@ class TrainingModule:
         """Returns its schedule in absolute steps, for log and report; empty: nothing is planned."""
         return {}
 
-    def summary(self, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    @classmethod
+    def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """Returns figures for evaluation.json from the lines of metrics.jsonl; empty: nothing happened."""
         return {}
 
-    def remarks(self, evaluation: Mapping[str, Any]) -> Iterator[str]:
+    @classmethod
+    def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
         """Yields sentences for log and report about an evaluation, which holds the module's `summary`."""
         yield from ()
 

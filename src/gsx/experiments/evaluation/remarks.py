@@ -7,6 +7,7 @@ from typing import Any
 from gsx.core.plugins import hookimpl
 from gsx.core.training.minibatch import sum_by_scale
 from gsx.core.training.run import Run, StepResult
+from gsx.modules.catalogue import MODULES
 
 logger = logging.getLogger(__name__)
 
@@ -143,6 +144,9 @@ def left_out_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
 
 
 def saved_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what the run's modules said when it was evaluated."""
-    remarks = evaluation.get("remarks")
-    yield from (str(remark) for remark in (remarks if isinstance(remarks, list) else []))
+    """Yields what the run's modules said when it was evaluated; of an older evaluation, what they say of it now."""
+    if "remarks" in evaluation:
+        yield from map(str, evaluation["remarks"])
+    else:
+        for module, _ in MODULES.values():
+            yield from module.remarks(evaluation)

@@ -1,0 +1,23 @@
+"""The built-in training modules, in the order in which a run has them."""
+
+from collections.abc import Mapping
+
+from gsx.core.training.module import TrainingModule
+from gsx.modules.blur import Blur, BlurOptions
+from gsx.modules.coarse_to_fine import CoarseToFine, CoarseToFineOptions
+from gsx.modules.distractors import DistractorOptions, Distractors
+from gsx.modules.exposure import Exposure, ExposureOptions
+from gsx.modules.plateau import Plateau, PlateauOptions
+from gsx.modules.poses import PoseOptions, Poses
+from gsx.modules.supersampling import Supersampling, SupersamplingOptions
+
+MODULES: Mapping[str, tuple[type[TrainingModule], type]] = {
+    "coarse_to_fine": (CoarseToFine, CoarseToFineOptions),
+    "supersampling": (Supersampling, SupersamplingOptions),
+    "plateau": (Plateau, PlateauOptions),
+    "poses": (Poses, PoseOptions),
+    "exposure": (Exposure, ExposureOptions),
+    "blur": (Blur, BlurOptions),
+    "distractors": (Distractors, DistractorOptions),
+}
+"""Module and options by name."""
