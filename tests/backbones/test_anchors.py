@@ -68,6 +68,10 @@ def stir(backbone: Anchors) -> None:
             parameter.copy_(noise * 0.3 - 2 if name == "log_scales" else parameter + 0.5 * noise)
 
 
+def cameras_of(backbone: Anchors) -> list[Camera]:
+    return [view.camera for view in backbone.scene.train]
+
+
 def render(backbone: Anchors, camera: Camera, step: int) -> tuple[DrawnAnchors, Rendering]:
     """A picture that counts, with its backward pass."""
     drawn = backbone.draw(camera, step)
@@ -204,7 +208,7 @@ def test_harmonics_join_every_thousand_steps() -> None:
 
 def test_unused_harmonics_count_their_steps() -> None:
     backbone = small_anchors("octree_gs3d")
-    render(backbone, backbone.cameras[0], 1)
+    render(backbone, cameras_of(backbone)[0], 1)
     backbone.update(1)
     assert float(backbone.table.optimiser.state[backbone.table["sh_rest"]]["step"]) == 1
     assert not backbone.table["sh_rest"].any()
@@ -304,8 +308,8 @@ def test_coarse_levels_are_drawn_and_finer_ones_added(name: str) -> None:
 
 def test_training_views_are_known_by_their_camera() -> None:
     backbone = small_anchors("scaffold", "heads.appearance=4")
-    assert [backbone.visible(camera, 1).view for camera in backbone.cameras] == [0, 1, 2, 3]
-    assert backbone.visible(backbone.cameras[2].zoom(2), 1).view == -1
+    assert [backbone.visible(camera, 1).view for camera in cameras_of(backbone)] == [0, 1, 2, 3]
+    assert backbone.visible(cameras_of(backbone)[2].zoom(2), 1).view == -1
     assert backbone.visible(CAMERA, 1).view == -1
 
 
@@ -319,7 +323,7 @@ def test_an_empty_picture_is_a_picture(name: str) -> None:
         shut = small_anchors(name)
         with torch.no_grad():
             shut.table.networks.modules.opacity[2].bias.fill_(-10.0)
-        cases.append((shut, shut.cameras[0]))
+        cases.append((shut, cameras_of(shut)[0]))
     for model, camera in cases:
         drawn, rendering = render(model, camera, 1000)
         assert len(drawn.splats) == 0
@@ -335,13 +339,13 @@ def test_an_empty_picture_is_a_picture(name: str) -> None:
 
 def test_the_volume_term_is_the_mean_over_what_is_drawn() -> None:
     backbone = small_anchors("scaffold")
-    drawn = backbone.draw(backbone.cameras[0], 1)
+    drawn = backbone.draw(cameras_of(backbone)[0], 1)
     scales = drawn.splats.scales.tolist()
     assert 0 < len(scales) < 10 * len(backbone.table)
     wanted = 0.01 * sum(a * b * c for a, b, c in scales) / len(scales)
     assert backbone.regulariser(drawn).item() == pytest.approx(wanted, rel=1e-5)
     explicit = small_anchors("octree_gs3d")
-    assert explicit.regulariser(explicit.draw(explicit.cameras[0], 1)) is None
+    assert explicit.regulariser(explicit.draw(cameras_of(explicit)[0], 1)) is None
 
 
 # -- statistics --------------------------------------------------------------------------------------------------------
@@ -356,7 +360,7 @@ def test_statistics_are_nested_as_in_a_loop(name: str) -> None:
     k, count = backbone.representation.offsets, len(backbone.table)
     names = ("visits", "opacity_sum", "gradient_sum", "gradient_count")
     wanted = [[0.0] * count, [0.0] * count, [0.0] * count * k, [0.0] * count * k]
-    for camera in backbone.cameras[:2]:
+    for camera in cameras_of(backbone)[:2]:
         drawn, rendering = render(backbone, camera, 1000)
         decoded = drawn.decoded
         opacity_of = dict(zip(decoded.slots.tolist(), decoded.splats.log_opacities.exp().tolist(), strict=True))
@@ -382,13 +386,13 @@ def test_statistics_are_nested_as_in_a_loop(name: str) -> None:
 @pytest.mark.parametrize(("step", "counts"), [(500, False), (501, True), (14999, True), (15000, False)])
 def test_statistics_are_gathered_while_anchors_are_judged(step: int, counts: bool) -> None:
     backbone = small_anchors("scaffold")
-    backbone.accumulate(backbone.observe(*render(backbone, backbone.cameras[0], step), step))
+    backbone.accumulate(backbone.observe(*render(backbone, cameras_of(backbone)[0], step), step))
     assert bool(backbone.table["visits"].any()) == counts
 
 
 def test_growth_comes_134_times_in_the_published_run_and_234_with_levels() -> None:
     for name, calls, last in (("scaffold", 134, 14900), ("octree_scaffold", 234, 24900)):
-        growing = small_anchors(name).growing()
+        growing = small_anchors(name).events
         due = [step for step in range(1, 40001) if growing.due(step)]
         assert (len(due), due[0], due[-1]) == (calls, 1600, last)
 
@@ -400,7 +404,7 @@ def judged(name: str, *overrides: str) -> Anchors:
     """After a step at 1600, with statistics that make some anchors grow and the first five go."""
     backbone = small_anchors(name, *overrides)
     stir(backbone)
-    render(backbone, backbone.cameras[0], 1600)
+    render(backbone, cameras_of(backbone)[0], 1600)
     table = backbone.table
     table["gradient_count"][:20] = 50.0
     table["gradient_sum"][:20] = 50.0 * 2.1e-4 if name != "scaffold" else 50.0
@@ -414,7 +418,7 @@ def test_a_growth_step_moves_only_the_networks(name: str) -> None:
     """Parameters made anew have no gradient; new rows have no moments; networks are untouched by the surgery."""
     backbone = judged(name)
     backbone.update(1600)
-    render(backbone, backbone.cameras[0], 1600)
+    render(backbone, cameras_of(backbone)[0], 1600)
     table, heads = backbone.table, dict(backbone.table.networks.named() if backbone.table.networks else ())
     moments = {n: table.optimiser.state[table[n]]["exp_avg"].clone() for n in table.parameters}
     held = {n: p.detach().clone() for n, p in heads.items()}
@@ -512,7 +516,7 @@ def test_fidelity_reaches_the_switches_of_levels_and_of_each_reference(name: str
     ):
         backbone = small_anchors(name, word)
         assert isinstance(backbone.grid, LevelGrids)
-        assert (backbone.quirks.bias, backbone.grid.levels.half_cell) == wanted
+        assert (backbone.options.switches().bias, backbone.grid.levels.half_cell) == wanted
     points = torch.tensor([[3.0, 3, 3], [4.0, 4, 4], [3.5, 3.2, 3.9]]).repeat(10, 1) + spread(30) / 8
     origins = {
         word: small_anchors(name, word, scene=small_scene(points)).grid.levels.origin

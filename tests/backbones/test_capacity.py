@@ -18,7 +18,7 @@ from tiny import LIGHT, final_tensors, stopped_at, tiny_run, tiny_settings
 from torch import Tensor
 
 from gsx.backbones.adaptive import Adaptive, AdaptiveOptions
-from gsx.backbones.capacity import Budget, BudgetOptions, Growing, with_rows, worth_in_training
+from gsx.backbones.capacity import Budget, BudgetOptions, EventSteps, with_rows, worth_in_training
 from gsx.backbones.gs3d import GS3D, gs3d
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.core.data.camera import Camera, look_at
@@ -36,7 +36,7 @@ from gsx.modules.blur import Blur, BlurOptions
 from gsx.modules.exposure import Exposure, ExposureOptions
 from gsx.modules.movement import motion_blurred
 
-PUBLISHED = Growing(500, 15000, 100)
+PUBLISHED = EventSteps(500, 15000, 100)
 """3D-GS: steps 600, 700, ... 14900."""
 
 
@@ -50,21 +50,21 @@ def options_of(capacity: str, **more: object) -> GS3DOptions:
 def test_events_of_the_published_run() -> None:
     due = [step for step in range(1, 30001) if PUBLISHED.due(step)]
     assert due == list(range(600, 15000, 100))
-    assert PUBLISHED.events() == len(due) == 144
+    assert PUBLISHED.count() == len(due) == 144
     assert [PUBLISHED.passed(step) for step in (500, 600, 7700, 14900, 20000)] == [0, 1 / 144, 0.5, 1, 1]
 
 
 @pytest.mark.parametrize(("start", "stop", "every"), [(17, 500, 43), (20, 600, 100), (0, 10, 3), (5, 7, 9), (0, 9, 3)])
 def test_events_are_counted_for_any_schedule(start: int, stop: int, every: int) -> None:
-    growing = Growing(start, stop, every)
+    growing = EventSteps(start, stop, every)
     due = [step for step in range(stop + 50) if growing.due(step)]
-    assert growing.events() == max(1, len(due))
+    assert max(1, growing.count()) == max(1, len(due))
     assert [growing.passed(step) for step in due] == [(i + 1) / len(due) for i in range(len(due))]
 
 
 def test_the_curve_of_a_budget_by_hand() -> None:
     """From 100 to 1,000: a quarter of the events, half of the way."""
-    budget = Budget(BudgetOptions(primitives=1000), small_context(small_scene(spread(1))), Growing(0, 17, 2))
+    budget = Budget(BudgetOptions(primitives=1000), small_context(small_scene(spread(1))), EventSteps(0, 17, 2))
     assert [budget.target(100, step) for step in (0, 4, 16)] == [100, 550, 1000]
     assert budget.target(2000, 4) == 1500  # more points than primitives: the curve falls
 
@@ -101,7 +101,7 @@ def test_every_backbone_takes_every_capacity(backbone: str, tmp_path: Path) -> N
 # -- validation windows ------------------------------------------------------------------------------------------------
 
 
-def adaptive(scene: Scene, growing: Growing = PUBLISHED, **more: float) -> Adaptive:
+def adaptive(scene: Scene, growing: EventSteps = PUBLISHED, **more: float) -> Adaptive:
     return Adaptive(AdaptiveOptions(**more), small_context(scene), growing, 0)  # type: ignore[arg-type]
 
 
@@ -183,7 +183,7 @@ def test_a_cap_that_holds_growth_is_told() -> None:
     scene = small_scene(spread(50))
     model = small_gs3d(scene, options=options_of("adaptive"))
     capped = Adaptive(AdaptiveOptions(rate=0.3), small_context(scene), PUBLISHED, 57)
-    assert capped.judge(model, lambda table: None, 700) == {"withheld": 8}  # 15 asked for, room for 7
+    assert capped.evaluate(model, lambda table: None, 700) == {"withheld": 8}  # 15 asked for, room for 7
 
 
 def test_what_no_view_shows_outlives_a_budget() -> None:
@@ -191,7 +191,7 @@ def test_what_no_view_shows_outlives_a_budget() -> None:
     points = spread(20)
     points[10:, 1] -= 50
     model = small_gs3d(small_scene(points), options=options_of("budget", budget=BudgetOptions(primitives=8)))
-    model.capacity.judge(model, lambda table: None, 14900)
+    model.capacity.evaluate(model, lambda table: None, 14900)
     assert len(model.table) == 8
     assert bool((model.table["means"][:, 1] < -40).all())
 
@@ -209,10 +209,10 @@ def test_a_budget_takes_as_much_from_what_any_view_shows(monkeypatch: pytest.Mon
     def left() -> list[int]:
         return (model.table["means"].detach()[:, 0] / 10).round().long().bincount(minlength=12).tolist()
 
-    model.capacity.judge(model, lambda table: None, 4100)  # a quarter of the events: half of the way, 60 too many
+    model.capacity.evaluate(model, lambda table: None, 4100)  # a quarter of the events: half of the way, 60 too many
     assert sum(left()) == 240 - 60 * 4 // 12
     assert left().count(20) >= 8
-    model.capacity.judge(model, lambda table: None, 14900)
+    model.capacity.evaluate(model, lambda table: None, 14900)
     assert sum(left()) == 120
     assert min(left()) >= 3
 
@@ -230,7 +230,7 @@ def test_nothing_grows_beyond_the_end_of_a_run() -> None:
     """Even where growth is to stop later than the published run: what learns on keeps its rows."""
     growing = small_gs3d(
         small_scene(spread(20)), options=published_options(stop=40000), iterations=30000
-    ).control.growing
+    ).control.events
     assert growing.due(30000)
     assert not any(growing.due(step) for step in range(30001, 40001))
 
@@ -307,7 +307,7 @@ def test_growth_goes_by_steps_not_by_events(every: int, room: int) -> None:
     """46 % of 50 over a hundred steps: 23; by two events in that time 20.83 % each, by one of twice that 113.16 %."""
     scene = small_scene(spread(50))
     table = small_gs3d(scene, options=options_of("adaptive")).table
-    judge = Adaptive(AdaptiveOptions(rate=0.46), small_context(scene), Growing(500, 15000, every), 0)
+    judge = Adaptive(AdaptiveOptions(rate=0.46), small_context(scene), EventSteps(500, 15000, every), 0)
     assert judge.room(table, 50, 700) == room
 
 
@@ -328,7 +328,7 @@ def test_the_rate_follows_the_gain(had: float, price: float, rate: float, monkey
     half = small_gs3d(small_scene(spread(25)), options=options_of("adaptive")).table
     errors = {50: torch.full((4,), 1e9).double(), 25: torch.full((4,), had * 1e9).double()}
     monkeypatch.setattr(Probe, "window_errors", lambda probe, windows: errors[len(probe.model.table)])
-    found = judge.judge(model, lambda table: half, 700)
+    found = judge.evaluate(model, lambda table: half, 700)
     assert judge.rate(model.table) == pytest.approx(rate, rel=1e-5)
     assert found["gain"] == pytest.approx(10 * math.log10(had) / 3, abs=1e-5)
     assert model.table.record["trials"][0, :3].tolist() == [700, 50, 25]
@@ -398,8 +398,8 @@ def test_what_no_picture_needs_is_removed_at_the_last_event() -> None:
     """What is too faint to be seen goes, and of the others those that make a difference stay."""
     scene, model = half_of_it_faint()
     judge = adaptive(scene, price=0.2)
-    assert judge.judge(model, lambda table: None, 700) == {}
-    done = judge.judge(model, lambda table: None, 14900)
+    assert judge.evaluate(model, lambda table: None, 700) == {}
+    done = judge.evaluate(model, lambda table: None, 14900)
     assert done["removed"] >= 20
     assert len(model.table) == 40 - done["removed"] > 0
     assert bool((model.table["opacity_logits"] > -15).all())
@@ -409,7 +409,7 @@ def test_what_rounding_hides_is_removed_though_photographs_are_met(monkeypatch: 
     """Without an error, a share of it would be a price that nothing is below."""
     monkeypatch.setattr(Probe, "difference", lambda probe, image, *_: torch.zeros_like(image))
     scene, model = half_of_it_faint()
-    assert adaptive(scene).judge(model, lambda table: None, 14900)["removed"] == 20
+    assert adaptive(scene).evaluate(model, lambda table: None, 14900)["removed"] == 20
     assert bool((model.table["opacity_logits"] > -15).all())
 
 
@@ -423,11 +423,11 @@ def test_unjudged_growth_is_published_growth_of_which_goes_what_no_picture_needs
     scene, model = half_of_it_faint()
     own = Adaptive(AdaptiveOptions(judged=False), small_context(scene), PUBLISHED, 1000)
     assert own.room(model.table, sys.maxsize, 700) == 1000 - len(model.table)
-    assert own.judge(model, lambda table: pytest.fail("nothing is tried"), 700) == {}
+    assert own.evaluate(model, lambda table: pytest.fail("nothing is tried"), 700) == {}
     assert all(own.validation_window(model.table, view, 650) is None for view in scene.train)
     assert own.room(model.table, sys.maxsize, 14900) == 0
     before = len(model.table)
-    assert own.judge(model, lambda table: None, 14900) == {"removed": before - len(model.table)}
+    assert own.evaluate(model, lambda table: None, 14900) == {"removed": before - len(model.table)}
     assert len(model.table) < before
 
 
@@ -437,7 +437,7 @@ def test_at_most_three_quarters_of_the_rows_go_at_once(monkeypatch: pytest.Monke
     scene = small_scene(spread(5))
     model = small_gs3d(scene, options=options_of("adaptive"))
     means = model.table["means"].detach().clone()
-    assert adaptive(scene).judge(model, lambda table: None, 14900) == {"removed": 3}
+    assert adaptive(scene).evaluate(model, lambda table: None, 14900) == {"removed": 3}
     assert torch.equal(model.table["means"], means[[2, 4]])
     assert float(model.table.record["removed_share"]) == 0.6
 
@@ -450,7 +450,7 @@ def test_events_go_on_asking_once_growth_has_ended_while_much_goes(
     scene = small_scene(spread(5))
     model = small_gs3d(scene, options=options_of("adaptive"))
     model.table.record |= {"trials": trials(rate), "removed_share": torch.tensor(before, dtype=torch.float64)}
-    assert adaptive(scene).judge(model, lambda table: None, 800) == ({"removed": 3} if asked else {})
+    assert adaptive(scene).evaluate(model, lambda table: None, 800) == ({"removed": 3} if asked else {})
 
 
 @pytest.mark.parametrize(
@@ -477,7 +477,7 @@ def test_finest_levels_that_gain_too_little_are_removed(
 
     monkeypatch.setattr(Probe, "window_errors", errors)
     judge = Adaptive(AdaptiveOptions(price=0.1, discount=1 / 3), small_context(scene), PUBLISHED, 0)
-    found = judge.without_idle_levels(model, 700)
+    found = judge.remove_idle_levels(model, 700)
     assert model.table["level"].unique().tolist() == left
     assert found["levels_removed"] == 3 - len(left)
     gain = 10 * math.log10(fine) / 3 / math.log2(40 / 24)
@@ -504,7 +504,7 @@ def test_a_level_that_a_render_hardly_shows_is_removed_if_it_is_the_finest(level
         model.table["opacity_logits"].fill_(2.0)
         model.table["opacity_logits"][levels == level] = -5.0
         model.table["sh_dc"][levels != level] = 0.0  # grey, as photographs
-    found = model.capacity.without_idle_levels(model, 30000)
+    found = model.capacity.remove_idle_levels(model, 30000)
     assert model.table["level"].unique().tolist() == left
     assert found["gain_of_level_1"] != 0
 
@@ -515,11 +515,11 @@ def test_levels_are_judged_when_growth_ends(monkeypatch: pytest.MonkeyPatch) -> 
     for rate, step, asked in ((0.1, 700, 0), (0.1, 14900, 1), (0.001, 14900, 0)):
         calls = list[int]()
         monkeypatch.setattr(
-            Adaptive, "without_idle_levels", lambda judge, model, step, calls=calls: calls.append(step) or {}
+            Adaptive, "remove_idle_levels", lambda judge, model, step, calls=calls: calls.append(step) or {}
         )
         model = small_gs3d(scene, options=options_of("adaptive"))
         model.table.record["trials"] = trials(rate)
-        adaptive(scene, price=0.2).judge(model, lambda table: None, step)
+        adaptive(scene, price=0.2).evaluate(model, lambda table: None, step)
         assert len(calls) == asked
 
 

@@ -16,11 +16,11 @@ from gsx.backbones import growth
 from gsx.backbones.decoding import Explicit, Neural
 from gsx.backbones.density import room_under
 from gsx.backbones.growth import (
+    DepthGrowth,
+    LevelGrowth,
     clamp_scales,
     eligible,
     fresh_statistics,
-    grow_by_depth,
-    grow_by_level,
     nodes_of,
     observe,
     prune,
@@ -82,7 +82,7 @@ def deepen(
 ) -> int:
     generator = torch.Generator().manual_seed(9)
     options = replace(PUBLISHED, **changes)
-    return grow_by_depth(table, representation, options, voxel, 40.0, early, generator, under(most, table))[0]
+    return DepthGrowth(table, representation, options, 40.0, under(most, table), voxel).grow(voxel, early, generator)[0]
 
 
 def grown(table: ParameterTable, before: int) -> list[tuple[float, ...]]:
@@ -302,9 +302,9 @@ def level_up(
     """`changes` are of quirks or of growth options."""
     quirks = replace(REFERENCE, **{name: value for name, value in changes.items() if name in CHOICES})
     options = replace(PUBLISHED, **{name: value for name, value in changes.items() if name not in CHOICES})
-    return grow_by_level(
-        table, representation, options, levels or three_levels(), 40.0, quirks, gate, under(most, table)
-    )[0]
+    levels = levels or three_levels()
+    event = LevelGrowth(table, representation, options, 40.0, under(most, table), levels.size(levels.count - 1))
+    return event.grow(levels, quirks, gate)[0]
 
 
 def grown_levels(table: ParameterTable, before: int) -> list[tuple]:
@@ -552,10 +552,10 @@ def test_the_largest_gradients_come_first_whatever_their_level() -> None:
     everything = grown_levels(table, 30)
     table, neural = random_cloud(0, levels=3)
     strengths = []
-    added = growth.Added.add
+    added = growth.Growth.add
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            growth.Added, "add", lambda self, new: strengths.extend(new.strength.tolist()) or added(self, new)
+            growth.Growth, "add", lambda self, new: strengths.extend(new.strength.tolist()) or added(self, new)
         )
         assert level_up(table, neural, most=30 + len(everything) // 3) == len(everything) // 3
     least = sorted(strengths, reverse=True)[len(everything) // 3 - 1]

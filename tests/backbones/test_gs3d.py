@@ -9,8 +9,8 @@ from small_scene import published_options, small_gs3d, small_scene, spread
 from torch import Tensor
 
 from gsx.backbones.density import mean_gradient
+from gsx.backbones.density_control import children
 from gsx.backbones.gs3d import GS3D
-from gsx.backbones.gs3d_parts import children
 from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
 from gsx.core.quality.losses import photometric

@@ -74,7 +74,7 @@ def test_an_event_undone_draws_what_was_drawn_before_it() -> None:
     split_along(model.table, chosen)
     numbers = torch.tensor([1.0, 2, 3])
     model.table.statistics["born"] = torch.cat([torch.zeros(27), numbers, numbers])
-    undone = model.control.densification.undone(model.table)
+    undone = model.control.before_last_event(model.table)
     assert undone is not None
     assert len(undone) == 30
     order = torch.cat([(~chosen).nonzero()[:, 0], chosen.nonzero()[:, 0]])
@@ -95,7 +95,7 @@ def test_what_draws_the_error_is_split_first() -> None:
         model.table["log_scales"].fill_(-1.5)
     for name in ("absolute", "gradient", "count"):
         model.table.statistics[name] = torch.ones(2)
-    done = model.control.densification.densify(model.control, model, step=14900)
+    done = model.control.add(model, step=14900)
     assert done == {"split": 1}
     left = model.table["means"].detach()[:, 0]
     assert float(left[0]) == -0.5  # the grey one stays
@@ -111,4 +111,4 @@ def budget_of(primitives: int):
 
 def test_nothing_is_undone_where_nothing_was_added() -> None:
     model = small_gs3d(small_scene(spread(5)), options=adaptive())
-    assert model.control.densification.undone(model.table) is None
+    assert model.control.before_last_event(model.table) is None

@@ -17,8 +17,8 @@ from torch.nn.functional import logsigmoid
 
 from gsx.backbones import mip
 from gsx.backbones.density import mean_absolute, mean_gradient, zero_statistics
+from gsx.backbones.density_control import candidates
 from gsx.backbones.gs3d import GS3D
-from gsx.backbones.gs3d_parts import candidates
 from gsx.backbones.mip import MATCHED, MipOptions, earned_size, filter_sizes, several_views
 from gsx.backbones.sampling import quantile
 from gsx.builtin import plugins

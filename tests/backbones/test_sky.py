@@ -102,7 +102,7 @@ def test_adaptive_growth_leaves_the_sky_alone_though_it_draws_the_largest_errors
 ) -> None:
     monkeypatch.setattr(Probe, "row_errors", lambda probe, views: 1.0 + torch.arange(len(probe.model.table)))
     backbone = with_sky(capacity="adaptive")
-    done = backbone.control.densification.densify(backbone.control, backbone, 600)
+    done = backbone.control.add(backbone, 600)
     assert done["split"] == 1
     assert int(far(backbone).sum()) == 2
 

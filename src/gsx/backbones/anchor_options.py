@@ -28,7 +28,7 @@ class Decay:
             )
 
     def at(self, step: int, steps: int) -> float:
-        """The rate of a step."""
+        """Returns the rate of a step."""
         return log_linear(step, steps, self.first, self.last) if self.first > 0 else 0.0
 
 
@@ -93,7 +93,7 @@ class AnchorOptions(CapacityOptions):
         self.switches()
 
     def switches(self) -> Quirks:
-        """All quirks decided, by themselves or by the fidelity.
+        """Returns all quirks, set one by one or by the fidelity.
 
         Raises:
             ValueError: a value is unknown.

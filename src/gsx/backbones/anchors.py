@@ -16,7 +16,7 @@ from torch.nn import Parameter
 
 from gsx.backbones.anchor_grids import grid_of
 from gsx.backbones.anchor_options import ExplicitOptions, HeadRates, NeuralOptions
-from gsx.backbones.capacity import Growing, growing_of, mark_newborn, without_newborn
+from gsx.backbones.capacity import event_steps, mark_newborn, without_newborn
 from gsx.backbones.capacity_options import capacity_of
 from gsx.backbones.cells import pooled_max
 from gsx.backbones.decoding import Decoded, Explicit, Neural, Representation, VisibleAnchors, lengths
@@ -41,14 +41,14 @@ from gsx.core.training.pseudo_views import PseudoView
 
 
 def neural_anchors(options: NeuralOptions, context: BackboneContext) -> "Anchors":
-    """The backbones scaffold and octree_scaffold."""
+    """Builds the backbones scaffold and octree_scaffold."""
     heads = Heads(options.heads, options.offsets, len(context.scene.train), context.generator).to(context.device)
     networks = Networks(heads, heads.colour)
     return Anchors(options, context, Neural(heads), networks=networks, network_rates=options.head_rates)
 
 
 def explicit_anchors(options: ExplicitOptions, context: BackboneContext) -> "Anchors":
-    """The backbone octree_gs3d as reported: anchors of one Gaussian."""
+    """Builds the backbone octree_gs3d as reported: anchors of one Gaussian."""
     logit = math.log(options.initial_opacity / (1 - options.initial_opacity))
     representation = Explicit(options.sh_degree, logit)
     return Anchors(options, context, representation, sh=(options.sh_degree, options.sh_every))
@@ -87,23 +87,21 @@ class Anchors:
         network_rates: HeadRates | None = None,
         sh: tuple[int, int] = (0, 1),
     ) -> None:
-        scene, points = context.scene, context.points()
-        self.options, self.representation, self.sh, self.scene = options, representation, sh, scene
-        self.sh_degree = sh[0]
-        self.network_rates, self.extent, self.views = network_rates, scene.extent, context.views
-        self.quirks = options.switches()
-        self.cameras = [view.camera for view in scene.train]
-        self.numbers = {camera: number for number, camera in enumerate(self.cameras)}
+        points = context.points()
+        self.options, self.representation, self.sh, self.sh_degree = options, representation, sh, sh[0]
+        self.network_rates, self.scene, self.views = network_rates, context.scene, context.views
+        self.numbers = {view.camera: number for number, view in enumerate(self.scene.train)}
         self.schedule = context.schedule(options.published_iterations)
-        self.filter = filter_named(options.filter, options.mip, context, self.schedule, self.growing().stop)
+        self.events = event_steps(options.growth, self.schedule)
+        self.filter = filter_named(options.filter, options.mip, context, self.schedule, self.events.stop)
         self.raster = self.filter.rules(context.raster)
-        self.capacity = capacity_of(options, context, self.growing())
+        self.capacity = capacity_of(options, context, self.events)
         self.grid = grid_of(options, context, self.schedule, points.positions.float())
         self.table = self.initial_table(points, networks, context.device)
         self.filter.refresh(self.table, self.table["anchors"])
 
     def initial_table(self, points: PointCloud, networks: Networks | None, device: torch.device) -> ParameterTable:
-        """Anchors on the grid nodes next to the points (Scaffold-GS, voxelize_sample; Octree-GS, octree_sample)."""
+        """Places anchors on grid nodes next to the points (Scaffold-GS, voxelize_sample; Octree-GS, octree_sample)."""
         positions, columns, owner, source = self.grid.start(points.positions.float())
         colours = pooled_max(points.colours[source].float() / 255, owner, len(positions))
         squares = mean_square_distance(positions).clamp_min(LEAST_SQUARE_DISTANCE)
@@ -113,28 +111,27 @@ class Anchors:
             {name: value.to(device) for name, value in (columns | {"anchors": positions}).items()},
             fresh_statistics(len(positions), self.representation.offsets, device),
             networks,
+            former_names={"sh_dc": "sh_constant"},
         )
-        self.capacity.begin(table)
+        self.capacity.initialise(table)
         return table
 
     # -- one step, in the order the trainer calls --------------------------------------------------------------
 
     def draw(self, camera: Camera, step: int) -> DrawnAnchors:
-        """The Gaussians of the anchors that the camera sees at its distance."""
+        """Returns the Gaussians of the anchors that the camera sees at its distance."""
         anchors = self.visible(camera, step)
         return DrawnAnchors(decoded=self.representation.decode(self.table, anchors, self.filter), anchors=anchors)
 
     def photograph_of(self, camera: Camera, step: int) -> int:
-        """Which training view a camera is: as the scene has it, or as the step does, coarser or of a corrected pose;
-        -1: none."""
+        """Returns the number of the training view with this camera, in the scene or at the step; -1: none."""
         if camera in self.numbers:
             return self.numbers[camera]
-        seen = (self.views.full_size, self.views.at(step))
-        numbered = (pair for views in seen for pair in enumerate(views))
+        numbered = (pair for views in (self.views.full_size, self.views.at(step)) for pair in enumerate(views))
         return next((number for number, view in numbered if view.camera is camera), -1)
 
     def visible(self, camera: Camera, step: int) -> VisibleAnchors:
-        """Anchors of the levels that the camera draws, of which those in view (Octree-GS; Scaffold-GS)."""
+        """Returns anchors of the levels that the camera draws, of which those in view (Octree-GS; Scaffold-GS)."""
         rows, weights = self.grid.visible(self.table, camera, step)
         reach = lengths(self.table["log_scales"].detach()[rows, :3])
         quats = self.representation.quats(self.table).detach()[rows]
@@ -151,15 +148,15 @@ class Anchors:
         )
 
     def regulariser(self, drawn: DrawnAnchors) -> Float[Tensor, ""] | None:
-        """Mean volume of the Gaussians drawn; 0 for none (Scaffold-GS, train.py)."""
+        """Returns the mean volume of the Gaussians drawn; 0 for none (Scaffold-GS, train.py)."""
         if not self.options.volume_weight:
             return None
         return volume_loss(drawn.splats.scales, self.options.volume_weight)
 
     def observe(self, drawn: DrawnAnchors, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
-        """Visits, opacities and screen gradients while anchors are judged (Scaffold-GS, training_statis)."""
+        """Returns visits, opacities and screen gradients while anchors grow (Scaffold-GS, training_statis)."""
         growth = self.options.growth
-        if not self.schedule.step(growth.observe_from) < step < self.growing().stop:
+        if not self.schedule.step(growth.observe_from) < step < self.events.stop:
             return {}
         decoded = drawn.decoded
         seen = densification_statistics(rendering.screen, decoded.slots, weight)
@@ -172,64 +169,61 @@ class Anchors:
             "weight": decoded.opacities.new_full((1,), weight),
         }
 
-    def accumulate(self, seen: Observation) -> None:
-        """Add an observation to the statistics."""
-        if seen:
-            observe(self.table, **seen)
+    def accumulate(self, observation: Observation) -> None:
+        """Adds an observation to the statistics."""
+        if observation:
+            observe(self.table, **observation)
 
     def pseudo_views_made(self, views: Sequence[PseudoView], step: int) -> None:
-        """Tells the filter."""
+        """Hands new pseudo views to the filter."""
         self.filter.pseudo_views_made(views)
 
     def densify_and_prune(self, step: int) -> Mapping[str, float]:
-        """Grow and prune when due (Scaffold-GS, train.py)."""
-        due = self.growing().due(step)
+        """Grows and prunes when due (Scaffold-GS, train.py)."""
+        due = self.events.due(step)
         if not due and not self.filter.narrows(step):
             return {}
-        done = self.grow_and_prune(step) if due else {}
+        metrics = self.grow_and_prune(step) if due else {}
         self.filter.refresh(self.table, self.table["anchors"], step)
-        return done
-
-    def growing(self) -> Growing:
-        """When anchors grow and go."""
-        return growing_of(self.options.growth, self.schedule)
+        return metrics
 
     def settles(self) -> list[int]:
-        """When growth ends."""
-        return [self.growing().stop]
+        """Returns when growth ends."""
+        return [self.events.stop]
 
     def validation_window(self, view: View, step: int) -> Window | None:
-        """What capacity is judged by."""
+        """Returns the window that capacity is measured by."""
         return self.capacity.validation_window(self.table, view, step)
 
     def grow_and_prune(self, step: int) -> dict[str, float]:
-        """Grow, forget what was judged, prune, clamp: the order of the reference (Scaffold-GS)."""
+        """Grows, zeroes eligible offsets, prunes, clamps: the order of the reference (Scaffold-GS)."""
         growth = self.options.growth
         visits = growth.success * self.schedule.interval(growth.every)
-        found = self.capacity.judge(self, without_newborn, step)
+        metrics = self.capacity.evaluate(self, without_newborn, step)
         enough, old = eligible(self.table, visits / 2)[0], len(self.table)
         room = self.capacity.room(self.table, sys.maxsize, step)
-        grown, without_room = self.grid.grow(self.table, self.representation, visits / 2, room, step)
+        grown, over_cap = self.grid.grow(self.table, self.representation, visits / 2, room, step)
         mark_newborn(self.table, old)
         reset_offsets(self.table, enough)
         pruned = prune(self.table, growth, visits)
-        unit = math.log(self.extent) if self.quirks.clamp == "extent" and self.extent > 0 else 0.0
+        extent = self.scene.extent
+        unit = math.log(extent) if self.options.switches().clamp == "extent" and extent > 0 else 0.0
         clamp_scales(self.table, growth.largest_log_scale + unit)
-        done = found | {"grown": grown, "pruned": pruned}
-        return done | ({"withheld": without_room} if without_room and not self.capacity.ranked else {})
+        metrics |= {"grown": grown, "pruned": pruned}
+        return metrics | ({"withheld": over_cap} if over_cap and not self.capacity.ranked else {})
 
     def set_rates(self, step: int) -> None:
-        """Learning rates of a step (Scaffold-GS, training_setup)."""
+        """Sets the learning rates of a step (Scaffold-GS, training_setup)."""
         steps = self.schedule.step(self.options.decay_until or self.options.published_iterations)
         for name in self.table.parameters:
-            unit = self.extent if name == "offsets" else 1.0
+            unit = self.scene.extent if name == "offsets" else 1.0
             self.table.set_rate(name, unit * getattr(self.options.rates, name).at(step, steps))
         if networks := self.table.networks:
             for name in networks.names():
                 networks.set_rate(name, getattr(self.network_rates, name).at(step, steps))
 
     def update(self, step: int) -> None:
-        """One Adam step of anchors and networks. Unused SH bands take part with zero gradients, as in 3D-GS."""
+        """Takes one Adam step of anchors and networks. Unused SH bands take part with zero gradients, as in 3D-GS."""
         moved = self.table.parameters.values()
         if any(parameter.grad is not None for parameter in moved):
             for parameter in moved:
@@ -246,7 +240,7 @@ class Anchors:
     # -- files and logs ----------------------------------------------------------------------------------------
 
     def explicit(self, camera: Camera | None, step: int) -> Gaussians:
-        """The Gaussians drawn for a camera; without one those of all anchors, of explicit representations only."""
+        """Returns the Gaussians drawn for a camera; without one those of all anchors, if these are explicit."""
         if camera is None and self.table.networks is not None:
             raise InputError(
                 f"backbone {self.options.name} decodes its Gaussians for one camera at a time, so there are none that "
@@ -257,29 +251,29 @@ class Anchors:
         return self.representation.explicit(decoded, self.table)
 
     def slot_count(self) -> int:
-        """One of each offset."""
+        """Returns the number of offsets of all anchors."""
         return len(self.table) * self.representation.offsets
 
     def slots(self, drawn: DrawnAnchors) -> tuple[Int[Tensor, "M"], Int[Tensor, "V"]]:
-        """Anchor row times k plus number of the offset; all offsets of the anchors in view."""
+        """Returns anchor row times k plus number of the offset; all offsets of the anchors in view."""
         k = drawn.decoded.opacities.shape[1]
         rows = drawn.anchors.rows
         return drawn.decoded.slots, (rows[:, None] * k + torch.arange(k, device=rows.device)).flatten()
 
     def everything(self) -> Decoded:
-        """All anchors of all levels, as seen from anywhere."""
+        """Decodes all anchors of all levels, as seen from anywhere."""
         anchors = self.table["anchors"]
         every = VisibleAnchors(
             rows=torch.arange(len(anchors), device=anchors.device),
             weights=torch.ones_like(anchors[:, 0]),
-            camera=self.cameras[0],
+            camera=self.scene.train[0].camera,
             view=-1,
             sh_degree=self.sh[0],
         )
         return self.representation.decode(self.table, every, self.filter)
 
     def file_columns(self) -> dict[str, Tensor]:
-        """Columns of the published files of each form (Octree-GS, save_ply): one row per anchor, raw values.
+        """Returns columns of the published files of each form (Octree-GS, save_ply): one row per anchor, raw values.
 
         With a 3D filter its sizes follow, under the name that they have in files of Mip-Splatting.
         """
@@ -289,12 +283,11 @@ class Anchors:
         return columns | ({"filter_3D": table["filter"]} if "filter" in table.columns else {})
 
     def file_notes(self) -> list[str]:
-        """Where the 3D filter is, and what chooses the levels at a distance (Octree-GS, save_ply)."""
+        """Returns where the 3D filter is, and what chooses the levels at a distance (Octree-GS, save_ply)."""
         filtered = f"{self.filter.note} of Gaussians; anchors have its size in filter_3D"
         return [filtered if self.filter.note else "no 3D filter", *self.grid.notes()]
 
     def plan(self) -> dict[str, Any]:
-        """The schedule in steps of this run, and what was derived from the scene."""
-        when = self.growing()
-        grow = {"from": when.start, "until": when.stop, "every": when.every}
+        """Returns the schedule in steps of this run, and what was derived from the scene."""
+        grow = {"from": self.events.start, "until": self.events.stop, "every": self.events.every}
         return {"grow": grow} | self.capacity.plan() | self.grid.plan(self.table)

@@ -1,10 +1,10 @@
-"""Who decides how many primitives a model has, as options say."""
+"""Options of capacity: who decides how many primitives a model has."""
 
 from dataclasses import dataclass
 from typing import Annotated
 
 from gsx.backbones.adaptive import Adaptive, AdaptiveOptions
-from gsx.backbones.capacity import Budget, BudgetOptions, Cap, Capacity, Growing
+from gsx.backbones.capacity import Budget, BudgetOptions, Capacity, EventSteps
 from gsx.core.ranges import Count, Range
 from gsx.core.training.backbone import BackboneContext
 
@@ -13,14 +13,14 @@ CAPACITIES = ("published", "budget", "adaptive")
 
 @dataclass(frozen=True, kw_only=True)
 class CapacityOptions:
-    """Who decides how many primitives there are, which every backbone of this package has."""
+    """Options of capacity, which every backbone of this package has."""
 
     max_primitives: Count
-    """No primitive is added beyond this number; 0: none is withheld."""
+    """No primitive is added beyond this number; 0: there is no cap."""
     capacity: str = "published"
     """published, budget or adaptive. The default: runs older than this option."""
     looks: Annotated[int, Range(1, 1000)] = 4
-    """Of a budget and adaptive: training views that the error of each primitive is found in at an event."""
+    """Of a budget and adaptive: training views that the error of each primitive is measured in at an event."""
     budget: BudgetOptions = BudgetOptions()
     adaptive: AdaptiveOptions = AdaptiveOptions()
 
@@ -39,10 +39,10 @@ class CapacityOptions:
             )
 
 
-def capacity_of(options: CapacityOptions, context: BackboneContext, growing: Growing) -> Capacity:
-    """The one that the options name."""
+def capacity_of(options: CapacityOptions, context: BackboneContext, events: EventSteps) -> Capacity:
+    """Builds the one that the options name."""
     if options.capacity == "budget":
-        return Budget(options.budget, context, growing)
+        return Budget(options.budget, context, events)
     if options.capacity == "adaptive":
-        return Adaptive(options.adaptive, context, growing, options.max_primitives)
-    return Cap(options.max_primitives)
+        return Adaptive(options.adaptive, context, events, options.max_primitives)
+    return Capacity(options.max_primitives)

@@ -11,10 +11,7 @@ LARGEST_KEY = 2**63 - 1
 
 
 def pooled_max(values: Float[Tensor, "M ..."], group: Int[Tensor, "M"], count: int) -> Float[Tensor, "U ..."]:
-    """Elementwise maximum of the rows of each group, `count` of them; -inf where a group has none.
-
-    Rows of group -1 are left out.
-    """
+    """Returns the largest values of the rows of each of `count` groups; -inf for empty groups, without group -1."""
     known = group >= 0
     rows = values[known]
     index = group[known].long().reshape(-1, *[1] * (rows.dim() - 1)).expand_as(rows)
@@ -23,8 +20,10 @@ def pooled_max(values: Float[Tensor, "M ..."], group: Int[Tensor, "M"], count: i
 
 
 def new_cells(candidates: Int[Tensor, "M 3"], taken: Int[Tensor, "T 3"]) -> tuple[Int[Tensor, "U 3"], Int[Tensor, "M"]]:
-    """(cells, group): every candidate cell that is not taken, once, in lexicographic order; and the row among those
-    of each candidate's cell, -1 where it is taken."""
+    """Returns (cells, group): candidate cells that are not taken, once, in lexicographic order; each candidate's row.
+
+    The row is among those cells; -1 where the candidate's cell is taken.
+    """
     if len(candidates) == 0:
         return candidates, candidates.new_empty(0)
     keys = cell_keys(torch.cat([candidates, taken]))
@@ -37,7 +36,7 @@ def new_cells(candidates: Int[Tensor, "M 3"], taken: Int[Tensor, "T 3"]) -> tupl
 
 
 def cell_keys(cells: Int[Tensor, "M 3"]) -> Int[Tensor, "M"]:
-    """One integer per cell, equal for equal cells and ordered as the cells are, lexicographically."""
+    """Returns one integer per cell, equal for equal cells and in their lexicographic order."""
     low, high = cells.amin(0).tolist(), cells.amax(0).tolist()
     _, height, depth = lengths = [last - first + 1 for first, last in zip(low, high, strict=True)]
     if math.prod(lengths) > LARGEST_KEY:
@@ -47,7 +46,7 @@ def cell_keys(cells: Int[Tensor, "M 3"]) -> Int[Tensor, "M"]:
 
 
 def ranked_keys(cells: Int[Tensor, "M 3"]) -> Int[Tensor, "M"]:
-    """The same for cells however far apart: coordinates and pairs are ranked, so that no product exceeds M^2."""
+    """Returns the same for cells however far apart, by ranks of coordinates: no product exceeds M^2."""
     keys = torch.zeros_like(cells[:, 0])
     for coordinate in cells.unbind(1):
         found, rank = coordinate.unique(return_inverse=True)

@@ -7,26 +7,27 @@ and stay as they are. Without pointers between levels, a Gaussian's level is all
 import logging
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from gsx.backbones.capacity import mark_newborn, without_newborn
 from gsx.backbones.cells import pooled_max
-from gsx.backbones.density import mean_gradient, withheld, within_room
+from gsx.backbones.density import mean_gradient, over_cap, within_room
 from gsx.backbones.density_control import DensityControl
 from gsx.backbones.growth_options import Quirks
-from gsx.backbones.gs3d_parts import Shown
+from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.levels import Levels, drawn, facts_of, initial_nodes, kept, note_of, thresholds, warnings_of
 from gsx.backbones.sampling import sampled_means
+from gsx.backbones.visibility import Shown, Visibility
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
 from gsx.core.quality.losses import volume_loss
 from gsx.core.ranges import Range, Share, Weight
 from gsx.core.rasterizer import take_rows
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.backbone import Backbone, DrawnSplats
+from gsx.core.training.backbone import Backbone, BackboneContext, DrawnSplats
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows
 
 logger = logging.getLogger(__name__)
@@ -52,8 +53,7 @@ class LevelDensityOptions:
             raise ValueError(f"backbone.clone_split.level_density.shrink is {self.shrink}; give 0 < shrink <= 1")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DensifyMasks:
+class DensifyMasks(NamedTuple):
     """What happens to each of N Gaussians."""
 
     cloned: Bool[Tensor, "N"]
@@ -62,7 +62,7 @@ class DensifyMasks:
 
 
 def starting_points(points: PointCloud, levels: Levels) -> tuple[PointCloud, dict[str, Tensor]]:
-    """(points, columns) to start from: the nodes of the levels, half a cell beyond, with their cells' largest colours.
+    """Returns (points, columns) to start from: nodes of the levels, half a cell beyond, in their largest colours.
 
     Source: Octree-GS, octree_sample and weed_out; GSOctree.
     """
@@ -74,7 +74,7 @@ def starting_points(points: PointCloud, levels: Levels) -> tuple[PointCloud, dic
 
 
 def relative_sizes(scales: Float[Tensor, "N 3"], of: Int[Tensor, "N"], count: int) -> Float[Tensor, "K"]:
-    """Mean scale of each level over that of level 0 (GSOctree); 1 where one of them is empty: nothing to compare."""
+    """Returns the mean scale of each level over that of level 0 (GSOctree); 1 where one of them is empty."""
     sizes = scales.double().mean(1)  # a mean for each level by itself: sums by index have no fixed order on a GPU
     means = torch.stack([sizes[of == level].sum() / (of == level).sum().clamp_min(1) for level in range(count)])
     known = (means > 0) & (means[0] > 0)
@@ -92,7 +92,7 @@ def densify_masks(
     large: float,
     splitting: bool,
 ) -> DensifyMasks:
-    """Who is cloned, split and drawn from farther: each by the threshold and the size of its own level (GSOctree).
+    """Marks what is cloned, split and drawn from farther, by the threshold and the size of its level (GSOctree).
 
     `threshold` and `large` (a scale, world units) are those of level 0; without `splitting` nothing happens to large
     ones. Ours: never a Gaussian without any gradient.
@@ -106,49 +106,47 @@ def densify_masks(
 
 
 def clones(raw: dict[str, Tensor], rows: Int[Tensor, "M"]) -> dict[str, Tensor]:
-    """Copies on the same level, without bias."""
-    return without_bias({name: value[rows] for name, value in raw.items()})
+    """Copies rows on the same level, without bias."""
+    return {name: value[rows] for name, value in raw.items()} | {"bias": torch.zeros_like(raw["bias"][rows])}
 
 
 def small_children(
     raw: dict[str, Tensor], rows: Int[Tensor, "M"], levels: Levels, shrink: float, generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """One child each, drawn from its parent's Gaussian, smaller and a level finer, without bias."""
+    """Draws one child from each parent's Gaussian, smaller and a level finer, without bias."""
     parents = {name: value[rows] for name, value in raw.items()}
     changed = {
         "means": sampled_means(parents, generator),
         "log_scales": parents["log_scales"] + math.log(shrink),
         "level": (parents["level"] + 1).clamp_max(levels.count - 1),
+        "bias": torch.zeros_like(parents["bias"]),
     }
-    return without_bias(parents | changed)
-
-
-def without_bias(rows: dict[str, Tensor]) -> dict[str, Tensor]:
-    """New Gaussians are drawn from no farther than their level."""
-    return rows | {"bias": torch.zeros_like(rows["bias"])}
+    return parents | changed
 
 
 def bias_levels(table: ParameterTable, biased: Bool[Tensor, "N"], step: float, most: float) -> None:
-    """Let Gaussians with fair gradients be drawn from a little farther, by at most so many levels."""
+    """Lets Gaussians with fair gradients be drawn from a little farther, by at most `most` levels."""
     table["bias"][: len(biased)] += step * biased
     table["bias"].clamp_max_(most)
 
 
-class VisibleByLevel:
+class VisibleByLevel(Visibility):
     """A camera draws the Gaussians of the levels that its distance asks for (Octree-GS)."""
+
+    by_level = True
 
     def __init__(self, levels: Levels) -> None:
         self.levels = levels
 
     def start(self, points: PointCloud) -> tuple[PointCloud, dict[str, Tensor]]:
-        """The nodes of the levels; columns `level` and `bias`."""
+        """Returns the nodes of the levels; columns `level` and `bias`."""
         cloud, columns = starting_points(points, self.levels)
         for warning in warnings_of(self.levels, len(cloud)):
             logger.warning("%s", warning)
         return cloud, columns
 
     def shown(self, table: ParameterTable, camera: Camera, step: int) -> Shown:
-        """Those of the levels that the camera draws, faded where the mode says so (Octree-GS, set_anchor_mask)."""
+        """Returns Gaussians of the levels that the camera draws, faded by the mode (Octree-GS, set_anchor_mask)."""
         means, level, bias = (table[name] for name in ("means", "level", "bias"))
         mask, weights = drawn(self.levels, means.detach(), level, bias, camera, self.levels.highest(step))
         rows = mask.nonzero()[:, 0]
@@ -157,63 +155,68 @@ class VisibleByLevel:
         return Shown(values=values, rows=rows, weights=weights[rows])
 
     def columns(self, table: ParameterTable) -> dict[str, Tensor]:
-        """Levels, and the distance at which the coarsest alone is drawn (GSOctree, save_ply)."""
+        """Returns levels, and the distance at which the coarsest alone is drawn (GSOctree, save_ply)."""
         info = torch.zeros_like(table["bias"])
         info[:1] = self.levels.farthest
         return {"level": table["level"].float(), "extra_level": table["bias"], "info": info}
 
     def plan(self, table: ParameterTable) -> dict[str, Any]:
-        """Levels in numbers."""
+        """Returns the levels in numbers."""
         return {"levels": facts_of(self.levels, table["level"])}
 
     def notes(self) -> list[str]:
-        """What chooses the levels at a distance."""
+        """Returns what chooses the levels at a distance."""
         return [note_of(self.levels)]
 
 
-class CloneSplitAcrossLevels:
-    """Copies of small Gaussians on their level, children of large ones a level finer (GSOctree)."""
+class CloneSplitAcrossLevels(DensityControl):
+    """Copies small Gaussians on their level, and gives large ones a child a level finer (GSOctree)."""
 
-    resets = False  # the published schedule does not reach a reset
+    def __init__(
+        self,
+        options: GS3DOptions,
+        context: BackboneContext,
+        levels: Levels,
+        level_density: LevelDensityOptions,
+        quirks: Quirks,
+    ) -> None:
+        super().__init__(options, context)
+        self.levels, self.level_density, self.quirks = levels, level_density, quirks
 
-    def __init__(self, visibility: VisibleByLevel, options: LevelDensityOptions, quirks: Quirks) -> None:
-        self.visibility, self.options, self.quirks = visibility, options, quirks
-
-    def densify(self, control: DensityControl, model: Backbone[Any], step: int) -> dict[str, float]:
-        """Parents stay; what too few cameras would draw is not made."""
-        table = model.table
-        levels, options, gradient = self.visibility.levels, self.options, mean_gradient(table)
+    def add(self, model: Backbone[Any], step: int) -> dict[str, float]:
+        """Adds copies and children that enough cameras would draw; parents stay."""
+        table, levels, options = model.table, self.levels, self.level_density
+        gradient = mean_gradient(table)
         masks = densify_masks(
             gradient,
             table["log_scales"].detach().exp(),
             table["level"],
             levels,
             options,
-            threshold=control.options.gradient,
-            large=control.options.split_extent * control.extent,
+            threshold=self.options.gradient,
+            large=self.options.split_extent * self.extent,
             splitting=self.quirks.gate == "open" or levels.highest(step) == levels.count - 1,
         )
         cloned, split = (mask.nonzero()[:, 0] for mask in (masks.cloned, masks.split))
         raw = detached_rows(table)
-        parts = clones(raw, cloned), small_children(raw, split, levels, options.shrink, control.generator)
+        parts = clones(raw, cloned), small_children(raw, split, levels, options.shrink, self.generator)
         new = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-        seen = kept(levels, new["means"], new["level"])
-        keep = within_room(
-            seen, gradient[torch.cat([cloned, split])], control.capacity.room(table, int(seen.sum()), step)
-        )
+        visible = kept(levels, new["means"], new["level"])
+        room = self.capacity.room(table, int(visible.sum()), step)
+        keep = within_room(visible, gradient[torch.cat([cloned, split])], room)
         bias_levels(table, masks.biased, options.bias_step, 1.0 if self.quirks.bias == "own" else math.inf)
         old = len(table)
         append_rows(table, {name: value[keep] for name, value in new.items()})
         mark_newborn(table, old)
-        done = {"cloned": int(keep[: len(cloned)].sum()), "split": int(keep[len(cloned) :].sum())}
-        return done | ({} if control.capacity.ranked else withheld(seen, keep))
+        metrics = {"cloned": int(keep[: len(cloned)].sum()), "split": int(keep[len(cloned) :].sum())}
+        return metrics | ({} if self.capacity.ranked else over_cap(visible, keep))
 
-    def undone(self, table: ParameterTable) -> ParameterTable | None:
-        """Without the copies and children."""
+    def before_last_event(self, table: ParameterTable) -> ParameterTable | None:
+        """Returns the table without the copies and children of the last event."""
         return without_newborn(table)
 
     def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
-        """Mean volume of what was drawn, 0 for nothing."""
-        if not self.options.volume_weight:
+        """Returns the mean volume of what was drawn, 0 for nothing."""
+        if not self.level_density.volume_weight:
             return None
-        return volume_loss(drawn.splats.scales, self.options.volume_weight)
+        return volume_loss(drawn.splats.scales, self.level_density.volume_weight)

@@ -1,4 +1,4 @@
-"""Colours of a lower SH degree that come nearest to a model's own, where training views see them.
+"""Colours of a lower SH degree that come nearest to those of a model, where training views see them.
 
 With another colour c' of row k a picture changes by w (c' - c), w the blending weights of k: by W |c' - c|^2 where that
 is squared and summed over pixels, W the sum of w^2. Summed over views it is least where the coefficients x of c' solve
@@ -66,7 +66,7 @@ def colour_fits(probe: Probe, views: Sequence[View], generator: torch.Generator,
 
 
 def coefficients_of(table: ParameterTable, degree: int) -> Float[Tensor, "n 3 N"]:
-    """Coefficients up to a degree less the constant ones, which are zero then."""
+    """Returns coefficients up to a degree less the constant ones, which are zero then."""
     rest = table["sh_rest"].detach()[:, : (degree + 1) ** 2 - 1]
     return torch.cat([torch.zeros_like(table["sh_dc"].detach()), rest], 1).permute(1, 2, 0)
 
@@ -95,25 +95,25 @@ def colours_less_constant(table: ParameterTable, render: ProbeRender) -> Float[T
 
 
 def fitted(fits: ColourFits, degree: int) -> Float[Tensor, "n 3 N"]:
-    """Coefficients of a degree that change the pictures least, less the constant ones as they are."""
+    """Solves for the coefficients of a degree that change pictures least, less the constant ones as they are."""
     n = (degree + 1) ** 2
     grams, products = fits.grams[:n, :n].permute(2, 0, 1), fits.products[:n].permute(2, 0, 1)
-    own = fits.current[:n].permute(2, 0, 1)
-    parts = zip(grams.split(AT_ONCE), products.split(AT_ONCE), own.split(AT_ONCE), strict=True)
+    current = fits.current[:n].permute(2, 0, 1)
+    parts = zip(grams.split(AT_ONCE), products.split(AT_ONCE), current.split(AT_ONCE), strict=True)
     return torch.cat([solved(*part) for part in parts]).permute(1, 2, 0)
 
 
 def solved(
-    grams: Float[Tensor, "N n n"], products: Float[Tensor, "N n 3"], own: Float[Tensor, "N n 3"]
+    grams: Float[Tensor, "N n n"], products: Float[Tensor, "N n 3"], current: Float[Tensor, "N n 3"]
 ) -> Float[Tensor, "N n 3"]:
-    """Of each row's equations, with the ridge; rows that no view shows keep their own."""
+    """Solves each row's equations with the ridge; rows that no view shows keep their coefficients."""
     mean = grams.diagonal(dim1=1, dim2=2).mean(1).clamp_min(torch.finfo(grams.dtype).tiny)[:, None, None]
     ridge = RIDGE * torch.eye(grams.shape[1], dtype=grams.dtype, device=grams.device)
-    return torch.linalg.solve(grams / mean + ridge, products / mean + RIDGE * own)
+    return torch.linalg.solve(grams / mean + ridge, products / mean + RIDGE * current)
 
 
 def squared_change(fits: ColourFits, coefficients: Float[Tensor, "n 3 N"]) -> Float[Tensor, "N"]:
-    """By how much the pictures change with these coefficients, squared and summed over pixels and views."""
+    """Returns the squared change of the pictures with these coefficients, summed over pixels and views."""
     n = len(coefficients)
     forward = torch.einsum("ijk,jck->ick", fits.grams[:n, :n], coefficients)
     return (fits.norms + (coefficients * (forward - 2 * fits.products[:n])).sum((0, 1))).clamp_min(0)
@@ -121,7 +121,7 @@ def squared_change(fits: ColourFits, coefficients: Float[Tensor, "n 3 N"]) -> Fl
 
 @torch.no_grad()
 def take_coefficients(table: ParameterTable, rows: Bool[Tensor, "N"], coefficients: Float[Tensor, "n 3 N"]) -> None:
-    """Give rows of a table these coefficients; bands above them, and all moments, stay as they are."""
-    found = coefficients.permute(2, 0, 1)[rows]
-    table["sh_dc"][rows] += found[:, :1]
-    table["sh_rest"][rows, : found.shape[1] - 1] = found[:, 1:]
+    """Gives rows of a table these coefficients; bands above them, and all moments, stay as they are."""
+    new = coefficients.permute(2, 0, 1)[rows]
+    table["sh_dc"][rows] += new[:, :1]
+    table["sh_rest"][rows, : new.shape[1] - 1] = new[:, 1:]

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -52,56 +51,23 @@ class Decoded:
     """Opacity of every offset of the anchors drawn, without gradient; what is not drawn counts as 0."""
 
 
-@runtime_checkable
-class Representation(Protocol):
-    """What an anchor holds, and how it is decoded."""
-
-    offsets: int
-    """k: Gaussians per anchor."""
-    pooled: tuple[str, ...]
-    """Parameters that a new anchor takes from its parents, as their largest values."""
-
-    def rows(self, log_lengths: Float[Tensor, "N"], colours: Float[Tensor, "N 3"]) -> dict[str, Tensor]:
-        """Raw parameters of new anchors, all six log-lengths alike; display colours in [0, 1]."""
-        ...
-
-    def decode(self, table: ParameterTable, visible: VisibleAnchors, filter_: Filter) -> Decoded:
-        """The Gaussians of the anchors drawn, differentiable."""
-        ...
-
-    def quats(self, table: ParameterTable) -> Float[Tensor, "N 4"]:
-        """Rotations of the anchors as ellipsoids, for the pre-filter (Scaffold-GS, prefilter_voxel)."""
-        ...
-
-    def explicit(self, decoded: Decoded, table: ParameterTable) -> Gaussians:
-        """The Gaussians decoded, as a standard splat file holds them."""
-        ...
-
-    def columns(self, table: ParameterTable, header: dict[str, Float[Tensor, "N"]]) -> dict[str, Float[Tensor, "N"]]:
-        """What follows positions and levels in the published file of this representation (Octree-GS, save_ply).
-
-        `header`: columns of the grid, which files of networks have first.
-        """
-        ...
-
-
 def lengths(log_scales: Float[Tensor, "A V"]) -> Float[Tensor, "A V"]:
-    """exp, finite when squared."""
+    """Returns exp, finite when squared."""
     return log_scales.clamp(max=LARGEST_LOG_SCALE).exp()
 
 
 def identity_quats(values: Float[Tensor, "N *rest"]) -> Float[Tensor, "N 4"]:
-    """(1, 0, 0, 0) for every row of `values`."""
+    """Returns (1, 0, 0, 0) for every row of `values`."""
     return torch.eye(1, 4, dtype=values.dtype, device=values.device).expand(len(values), 4)
 
 
 def numbered(prefix: str, values: Float[Tensor, "N V"]) -> dict[str, Float[Tensor, "N"]]:
-    """Columns of a file, by number."""
+    """Returns columns of a file, by number."""
     return {f"{prefix}{i}": column.detach() for i, column in enumerate(values.unbind(1))}
 
 
 def baked(splats: Splats, constant: Float[Tensor, "M 3"], rest: Float[Tensor, "M B 3"]) -> Gaussians:
-    """Gaussians of a standard file that draw these splats."""
+    """Returns Gaussians of a standard file that draw these splats."""
     return Gaussians(
         means=splats.means.detach(),
         log_scales=splats.scales.detach().clamp_min(LEAST).log(),
@@ -116,13 +82,13 @@ class Neural:
     """Features decoded by networks into k Gaussians, of which those with positive opacity are drawn (Scaffold-GS)."""
 
     pooled: tuple[str, ...] = ("features",)
+    """Parameters that a new anchor takes from its parents, as their largest values."""
 
     def __init__(self, heads: Heads) -> None:
-        self.heads = heads
-        self.offsets = heads.offsets
+        self.heads, self.offsets = heads, heads.offsets
 
     def rows(self, log_lengths: Float[Tensor, "N"], colours: Float[Tensor, "N 3"]) -> dict[str, Tensor]:
-        """Zero features and offsets."""
+        """Returns parameters of new anchors, all six log-lengths alike: zero features and offsets."""
         count = len(log_lengths)
         return {
             "offsets": log_lengths.new_zeros(count, self.offsets, 3),
@@ -131,7 +97,7 @@ class Neural:
         }
 
     def decode(self, table: ParameterTable, visible: VisibleAnchors, filter_: Filter) -> Decoded:
-        """mu = x + O l[0:3], s = l[3:6] sigmoid, q normalised by the rasterizer, opacity tanh > 0 (Scaffold-GS)."""
+        """Decodes the anchors drawn: mu = x + O l[0:3], s = l[3:6] sigmoid, opacity tanh > 0 (Scaffold-GS)."""
         rows, k = visible.rows, self.offsets
         anchors = table["anchors"][rows]
         raw, shapes, colours = self.heads(
@@ -158,16 +124,19 @@ class Neural:
         return Decoded(splats=splats, slots=rows[owner] * k + chosen % k, opacities=opacities.detach().clamp_min(0))
 
     def quats(self, table: ParameterTable) -> Float[Tensor, "N 4"]:
-        """An anchor's own rotation never learns in the reference, so it is the identity (Scaffold-GS)."""
+        """Returns identities: an anchor's rotation never learns in the reference (Scaffold-GS)."""
         return identity_quats(table["anchors"])
 
     def explicit(self, decoded: Decoded, table: ParameterTable) -> Gaussians:
-        """Colours as the camera saw them, in the constant band."""
+        """Returns Gaussians of a splat file with colours as the camera saw them, in the constant band."""
         colours = constant_from_colour(decoded.splats.colours)
         return baked(decoded.splats, colours, colours.new_zeros(len(colours), 0, 3))
 
     def columns(self, table: ParameterTable, header: dict[str, Float[Tensor, "N"]]) -> dict[str, Float[Tensor, "N"]]:
-        """79 floats a row with the position; what never learns has its initial value (Scaffold-GS, create_from_pcd)."""
+        """Returns file columns after positions, the grid's `header` first; what never learns has its initial value.
+
+        Source: Scaffold-GS, create_from_pcd.
+        """
         inert = torch.full_like(table["anchors"][:, 0], INERT_LOGIT)
         return (
             header
@@ -189,7 +158,7 @@ class Explicit:
         self.sh_degree, self.initial_logit = sh_degree, initial_logit
 
     def rows(self, log_lengths: Float[Tensor, "N"], colours: Float[Tensor, "N 3"]) -> dict[str, Tensor]:
-        """The colour in the constant band, opacity as configured, no offset."""
+        """Returns parameters of new anchors: colours in [0, 1] in the constant band, no offset."""
         count = len(log_lengths)
         return {
             "offsets": log_lengths.new_zeros(count, 1, 3),
@@ -201,7 +170,7 @@ class Explicit:
         }
 
     def decode(self, table: ParameterTable, visible: VisibleAnchors, filter_: Filter) -> Decoded:
-        """mu = x + O l[0:3], s = l[3:6], opacity sigmoid times the level's weight."""
+        """Decodes the anchors drawn: mu = x + O l[0:3], s = l[3:6], opacity sigmoid times the level's weight."""
         rows = visible.rows
         row = {name: take_rows(table[name], rows) for name in table.parameters}
         size = lengths(row["log_scales"])
@@ -221,16 +190,16 @@ class Explicit:
         return Decoded(splats=splats, slots=rows, opacities=opacities)
 
     def quats(self, table: ParameterTable) -> Float[Tensor, "N 4"]:
-        """The Gaussian's own."""
+        """Returns the rotations of the Gaussians."""
         return table["quats"]
 
     def explicit(self, decoded: Decoded, table: ParameterTable) -> Gaussians:
-        """All bands."""
+        """Returns Gaussians of a splat file with all bands."""
         rows = decoded.slots
         return baked(decoded.splats, table["sh_dc"].detach()[rows, 0], table["sh_rest"].detach()[rows])
 
     def columns(self, table: ParameterTable, header: dict[str, Float[Tensor, "N"]]) -> dict[str, Float[Tensor, "N"]]:
-        """67 floats a row with position and level at degree 3; f_rest is channel-major."""
+        """Returns file columns after positions and levels; f_rest is channel-major."""
         return (
             numbered("f_offset_", table["offsets"].flatten(1))
             | numbered("f_dc_", table["sh_dc"][:, 0])
@@ -239,3 +208,7 @@ class Explicit:
             | numbered("scale_", table["log_scales"])
             | numbered("rot_", table["quats"])
         )
+
+
+Representation = Neural | Explicit
+"""What an anchor holds, and how it is decoded."""

@@ -1,4 +1,4 @@
-"""Adaptive density control's arithmetic: what renders tell of each primitive, and who may be added under a cap.
+"""Adaptive density control's arithmetic: statistics of renders for each primitive, and a cap on additions.
 
 Statistics are per-primitive sums over the renders since the last density event, each counted by its weight in a step's
 loss. The photograph of a step of one view weighs 1; of n views each weighs 1 / n; a pseudo view weighs what its mean
@@ -21,31 +21,31 @@ GATHERED = frozenset({"gradient", "count", "absolute"})
 
 
 def room_under(cap: int, count: int) -> int:
-    """Rows that may be added to `count` of them under a cap; a cap of 0 is none."""
+    """Returns how many rows may be added to `count` of them under a cap; a cap of 0 is none."""
     return max(0, cap - count) if cap else sys.maxsize
 
 
 def within_room(chosen: Bool[Tensor, "N"], gradient: Float[Tensor, "N"], room: int) -> Bool[Tensor, "N"]:
-    """Of the chosen rows those with the largest gradients, at most `room`."""
+    """Keeps of the chosen rows those with the largest gradients, at most `room`."""
     if int(chosen.sum()) <= room:
         return chosen
     ranked = torch.where(chosen, gradient, -1.0).argsort(descending=True, stable=True)[:room]
     return torch.zeros_like(chosen).index_fill_(0, ranked, True)
 
 
-def withheld(wanted: Bool[Tensor, "N"], chosen: Bool[Tensor, "N"]) -> dict[str, float]:
-    """How many of the rows wanted a cap has kept out, for the changes of a step; nothing where it let all in."""
-    count = int(wanted.sum()) - int(chosen.sum())
+def over_cap(eligible: Bool[Tensor, "N"], chosen: Bool[Tensor, "N"]) -> dict[str, float]:
+    """Returns how many eligible rows are over the cap, for the metrics of a step; empty: none."""
+    count = int(eligible.sum()) - int(chosen.sum())
     return {"withheld": count} if count else {}
 
 
 def densification_statistics(
     screen: ScreenStatistics, drawn: Int[Tensor, "N"] | None = None, weight: float = 1.0
 ) -> dict[str, Tensor]:
-    """Of one render after its backward pass the norms of the screen gradients of primitives, and how much each was
-    seen: `weight`, that of the render in the loss, or 0 where it was not visible (3D-GS).
+    """Returns norms of the screen gradients of one render, and how much each primitive was seen (3D-GS).
 
-    `drawn`: rows of the splats that were rendered; None: splat n is row n.
+    That is `weight`, the render's weight in the loss, or 0 where a primitive was not visible. `drawn`: rows of the
+    splats that were rendered; None: splat n is row n.
     """
     visible = screen.visible
     seen = {
@@ -59,12 +59,12 @@ def densification_statistics(
 
 
 def mean_of(sums: Float[Tensor, "*N"], counts: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
-    """Sums over sums of weights; where nothing was counted the sum itself, which is 0."""
+    """Divides sums by sums of weights; where nothing was counted it returns the sum itself, which is 0."""
     return sums / torch.where(counts > 0, counts, 1.0)
 
 
 def gradient_statistics(count: int, device: torch.device | str, absolute: bool = False) -> dict[str, Tensor]:
-    """Fresh statistics of `count` primitives, for a table.
+    """Returns empty statistics of `count` primitives, for a table.
 
     `gradient`: sum of the norm of the screen gradient in NDC units. `count`: sum of the weights of the renders in which
     the primitive was visible: steps, where all see it. `absolute`, where it is gathered: sum of |g_x| + |g_y| over
@@ -75,7 +75,7 @@ def gradient_statistics(count: int, device: torch.device | str, absolute: bool =
 
 
 def add_statistics(table: ParameterTable, seen: dict[str, Tensor]) -> None:
-    """Count in what `densification_statistics` found in one render."""
+    """Adds what `densification_statistics` returned for one render."""
     sums, rows = table.statistics, seen["rows"]
     sums["gradient"].index_add_(0, rows, seen["gradient"].to(sums["gradient"]))
     sums["count"].index_add_(0, rows, seen["weight"].to(sums["count"]))
@@ -84,16 +84,16 @@ def add_statistics(table: ParameterTable, seen: dict[str, Tensor]) -> None:
 
 
 def zero_statistics(table: ParameterTable) -> None:
-    """Begin to count anew."""
+    """Zeroes the statistics of renders."""
     for name in GATHERED & table.statistics.keys():
         table.statistics[name] = torch.zeros_like(table.statistics[name])
 
 
 def mean_gradient(table: ParameterTable) -> Float[Tensor, "N"]:
-    """Weighted mean norm over the renders that saw the primitive; 0 for unseen ones."""
+    """Returns the weighted mean norm over the renders that saw the primitive; 0 for unseen ones."""
     return mean_of(table.statistics["gradient"], table.statistics["count"])
 
 
 def mean_absolute(table: ParameterTable) -> Float[Tensor, "N"]:
-    """The same of the absolute gradients."""
+    """Returns the same of the absolute gradients."""
     return mean_of(table.statistics["absolute"], table.statistics["count"])

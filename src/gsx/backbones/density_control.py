@@ -1,96 +1,163 @@
-"""Adaptive density control of free Gaussians: when it acts, and what every way of making new ones shares (3D-GS)."""
+"""Adaptive density control of free Gaussians: when it acts, what all its ways share, and clone and split (3D-GS)."""
 
 import math
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from gsx.backbones.capacity import Capacity, growing_of
-from gsx.backbones.density import zero_statistics
-from gsx.backbones.gs3d_options import Density
-from gsx.backbones.gs3d_parts import Densification, everything, extents, largest_scales
+from gsx.backbones.capacity import event_steps
+from gsx.backbones.capacity_options import capacity_of
+from gsx.backbones.density import mean_absolute, mean_gradient, over_cap, within_room, zero_statistics
+from gsx.backbones.gs3d_options import Density, GS3DOptions
 from gsx.backbones.mip import Filter
+from gsx.backbones.sampling import quantile, sampled_means
 from gsx.backbones.sky import not_sky
+from gsx.backbones.visibility import everything, extents
 from gsx.core.gaussians.smoothing import logit_of_log
-from gsx.core.training.backbone import Backbone, BackboneContext
-from gsx.core.training.parameter_table import ParameterTable, keep_rows, reset_column
-from gsx.core.training.schedule import Schedule
+from gsx.core.shapes import Bool, Float
+from gsx.core.training.backbone import Backbone, BackboneContext, DrawnSplats
+from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows, keep_rows, reset_column
 
 
 class DensityControl:
-    """Densifies, prunes and resets opacities (Kerbl et al. 2023, section 5)."""
+    """Adds, prunes and resets the opacities of Gaussians (Kerbl et al. 2023, section 5); subclasses say how to add."""
 
-    def __init__(
-        self, options: Density, capacity: Capacity, context: BackboneContext, schedule: Schedule, how: Densification
-    ) -> None:
-        self.options, self.capacity, self.schedule, self.densification = options, capacity, schedule, how
+    resets = False
+    """Whether opacities are reset while it runs."""
+
+    def __init__(self, options: GS3DOptions, context: BackboneContext) -> None:
+        self.options, self.context = options.density, context
         self.extent, self.generator = context.scene.extent, context.generator
-        self.context = context
-        self.growing = growing_of(options, schedule)
-        self.white = bool((context.scene.background == 1).all())
+        self.schedule = context.schedule(options.published_iterations)
+        self.events = event_steps(self.options, self.schedule)
+        self.capacity = capacity_of(options, context, self.events)
+        self.reset_every = self.schedule.interval(self.options.reset_every, self.options.reset_passes)
+        white = bool((context.scene.background == 1).all())
+        self.white_reset = max(1, self.schedule.step(self.options.white_reset)) if white else 0
+        """Step of an extra reset on a white background (3D-GS, train.py); 0: there is none."""
 
-    # -- when ----------------------------------------------------------------------------------------------------
+    # -- how Gaussians are added ---------------------------------------------------------------------------------
 
-    def ends(self) -> int:
-        """Step from which nothing is densified, pruned or observed."""
-        return self.growing.stop
+    def add(self, model: Backbone[Any], step: int) -> dict[str, float]:
+        """Adds Gaussians; returns how many in which way, and how many are over the cap."""
+        raise NotImplementedError
 
-    def due(self, step: int) -> bool:
-        """After `start`, before `stop`, every interval."""
-        return self.growing.due(step)
+    def before_last_event(self, table: ParameterTable) -> ParameterTable | None:
+        """Returns the table as it would be had the last event added nothing, for adaptive capacity; None: it did."""
+        return None
 
-    def reset_interval(self) -> int:
-        """Steps between opacity resets."""
-        return self.schedule.interval(self.options.reset_every, self.options.reset_passes)
+    def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
+        """Returns a term of the loss of a view, or None."""
+        return None
+
+    # -- events --------------------------------------------------------------------------------------------------
 
     def reset_due(self, step: int) -> bool:
-        """While density control runs every reset interval, and once early on a white background (3D-GS, train.py); or
-        never."""
-        if not self.densification.resets or step >= self.ends():
-            return False
-        return step % self.reset_interval() == 0 or (self.white and step == self.white_reset())
-
-    def white_reset(self) -> int:
-        """Step of the extra reset."""
-        return max(1, self.schedule.step(self.options.white_reset))
-
-    # -- what ----------------------------------------------------------------------------------------------------
+        """Returns whether opacities are reset at a step: while density control runs, every reset interval."""
+        due = step % self.reset_every == 0 or step == self.white_reset
+        return self.resets and step < self.events.stop and due
 
     def densify(self, model: Backbone[Any], step: int) -> dict[str, float]:
-        """Judge what there is; clone and split, then prune; begin to count anew (3D-GS, densify_and_prune: the order
-        in one event)."""
-        found = self.capacity.judge(model, self.densification.undone, step)
-        done = found | self.densification.densify(self, model, step)
-        done["pruned"] = self.prune(model.table, step)
+        """Evaluates, adds, prunes, and zeroes statistics (3D-GS, densify_and_prune: the order in one event)."""
+        metrics = self.capacity.evaluate(model, self.before_last_event, step)
+        metrics |= self.add(model, step)
+        metrics["pruned"] = self.prune(model.table, step)
         zero_statistics(model.table)
-        return done
+        return metrics
 
     def prune(self, table: ParameterTable, step: int) -> int:
-        """Remove faint primitives, and after the first reset huge ones; returns how many."""
-        doomed = table["opacity_logits"].sigmoid() < self.options.prune_opacity
-        if step > self.reset_interval():
-            doomed |= (largest_scales(table) > self.options.prune_extent * self.extent) & not_sky(table)
-        if bool(doomed.all()):  # a cloud about to vanish keeps what it has (gaussian-splatting issue 482)
+        """Removes faint primitives, and after the first reset huge ones; returns how many."""
+        pruned = table["opacity_logits"].sigmoid() < self.options.prune_opacity
+        if step > self.reset_every:
+            pruned |= (largest_scales(table) > self.options.prune_extent * self.extent) & not_sky(table)
+        if bool(pruned.all()):  # a cloud about to vanish keeps what it has (gaussian-splatting issue 482)
             return 0
-        keep_rows(table, ~doomed)
-        return int(doomed.sum())
+        keep_rows(table, ~pruned)
+        return int(pruned.sum())
 
     def reset_opacities(self, table: ParameterTable, filter_: Filter) -> None:
-        """o <- min(o, reset_opacity), moments zeroed (3D-GS); with a 3D filter o is what is drawn (Mip-Splatting). The
-        sky stays as opaque as it is."""
+        """Sets o <- min(o, reset_opacity), moments zeroed (3D-GS); the sky stays as opaque as it is.
+
+        With a 3D filter o is what is drawn (Mip-Splatting).
+        """
         logits, drawn = table["opacity_logits"].detach(), extents(table, everything(table), filter_)[1].detach()
         excess = (drawn - math.log(self.options.reset_opacity)).clamp_min(0) * not_sky(table)
         lowered = torch.where(excess > 0, logit_of_log(logsigmoid(logits) - excess), logits)
         reset_column(table, "opacity_logits", lowered)
 
     def plan(self) -> dict[str, Any]:
-        """The schedule in steps of this run."""
-        resets = {"every": self.reset_interval(), "until": self.ends()}
-        resets |= {"white_background": self.white_reset()} if self.white and self.white_reset() < self.ends() else {}
+        """Returns the schedule in steps of this run."""
+        ends = self.events.stop
+        resets = {"every": self.reset_every, "until": ends}
+        resets |= {"white_background": self.white_reset} if 0 < self.white_reset < ends else {}
         return {
-            "densify": {"from": self.growing.start, "until": self.ends(), "every": self.growing.every},
+            "densify": {"from": self.events.start, "until": ends, "every": self.events.every},
             **self.capacity.plan(),
-            **({"opacity_reset": resets} if self.densification.resets else {}),
-            "prune_huge": {"from": self.reset_interval()},
+            **({"opacity_reset": resets} if self.resets else {}),
+            "prune_huge": {"from": self.reset_every},
         }
+
+
+class CloneSplit(DensityControl):
+    """3D-GS: clones small and splits large Gaussians with large gradients (Kerbl et al. 2023, section 5.2)."""
+
+    resets = True
+
+    def add(self, model: Backbone[Any], step: int) -> dict[str, float]:
+        """Replaces split parents by two children each, and clones (3D-GS, densify_and_clone, densify_and_split)."""
+        table, options = model.table, self.options
+        gradient = mean_gradient(table)
+        eligible = candidates(table, gradient, options) & not_sky(table)
+        chosen = within_room(eligible, gradient, self.capacity.room(table, int(eligible.sum()), step))
+        large = largest_scales(table) > options.split_extent * self.extent
+        cloned, split = chosen & ~large, chosen & large
+        clone_and_split(table, cloned, split, options.split_shrink, self.generator)
+        return {"cloned": int(cloned.sum()), "split": int(split.sum())} | over_cap(eligible, chosen)
+
+
+def candidates(table: ParameterTable, gradient: Float[Tensor, "N"], options: Density) -> Bool[Tensor, "N"]:
+    """Marks primitives to clone or split: by mean gradient, and as many again by mean absolute gradient.
+
+    Source: Mip-Splatting. Ours: never those without any gradient. Where none has one the published rule would choose
+    all.
+    """
+    chosen = gradient >= options.gradient
+    if not options.absolute:
+        return chosen
+    absolute = mean_absolute(table)
+    quiet = 1 - int(chosen.sum()) / len(chosen)
+    return chosen | ((absolute >= quantile(absolute, quiet)) & (absolute > 0))
+
+
+def largest_scales(table: ParameterTable) -> Float[Tensor, "N"]:
+    """Returns the largest standard deviation of each primitive, world units."""
+    return table["log_scales"].detach().amax(1).exp()
+
+
+def clone_and_split(
+    table: ParameterTable,
+    cloned: Bool[Tensor, "N"],
+    split: Bool[Tensor, "N"],
+    shrink: float,
+    generator: torch.Generator,
+) -> None:
+    """Changes rows to survivors, clones, first children, second children."""
+    raw = detached_rows(table)
+    parents = {name: value[split] for name, value in raw.items()}
+    twins = [children(parents, shrink, generator) for _ in range(2)]
+    added = {name: torch.cat([value[cloned], *(twin[name] for twin in twins)]) for name, value in raw.items()}
+    replace_rows(table, split, added)
+
+
+def children(rows: dict[str, Tensor], shrink: float, generator: torch.Generator) -> dict[str, Tensor]:
+    """Draws one child from each parent's Gaussian, `shrink` times smaller (3D-GS, densify_and_split)."""
+    return rows | {"means": sampled_means(rows, generator), "log_scales": rows["log_scales"] - math.log(shrink)}
+
+
+def replace_rows(table: ParameterTable, removed: Bool[Tensor, "N"], added: dict[str, Tensor]) -> None:
+    """Appends rows, then removes the marked ones of those before."""
+    append_rows(table, added)
+    new = torch.ones(len(table) - len(removed), dtype=torch.bool, device=removed.device)
+    keep_rows(table, torch.cat([~removed, new]))

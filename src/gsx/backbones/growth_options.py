@@ -85,15 +85,15 @@ FIDELITIES = {"reference": {name: values[0] for name, values in CHOICES.items()}
 
 
 def resolved(quirks: Quirks, fidelity: str, published: Mapping[str, str] = MappingProxyType({})) -> Quirks:
-    """Every switch that is '' as the fidelity has it; `published`: where the reference at hand differs from `CHOICES`.
+    """Sets every switch that is '' by the fidelity; `published`: where this reference differs from `CHOICES`.
 
     Raises:
         ValueError: a value is unknown; it and the known ones are named.
     """
     if fidelity not in FIDELITIES:
         raise ValueError(f"backbone.fidelity is '{fidelity}'; choose {' or '.join(FIDELITIES)}")
-    asked = {**FIDELITIES[fidelity], **(published if fidelity == "reference" else {})}
-    values = {name: value or asked[name] for name, value in vars(quirks).items()}
+    defaults = {**FIDELITIES[fidelity], **(published if fidelity == "reference" else {})}
+    values = {name: value or defaults[name] for name, value in vars(quirks).items()}
     for name, value in values.items():
         if value not in CHOICES[name]:
             raise ValueError(f"backbone.quirks.{name} is '{value}'; choose {' or '.join(CHOICES[name])}")

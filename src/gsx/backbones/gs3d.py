@@ -9,18 +9,17 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.nn.functional import normalize
 
-from gsx.backbones.capacity import LOOKS, growing_of
-from gsx.backbones.capacity_options import capacity_of
+from gsx.backbones.capacity import MOST_VIEWS
 from gsx.backbones.colour_fits import colour_fits
 from gsx.backbones.density import add_statistics, densification_statistics, gradient_statistics
-from gsx.backbones.density_control import DensityControl
+from gsx.backbones.density_control import CloneSplit, DensityControl
 from gsx.backbones.gs3d_options import GS3DOptions
-from gsx.backbones.gs3d_parts import AllVisible, CloneSplit, Densification, Shown, Visibility, everything, extents
 from gsx.backbones.long_axis import LongAxis
 from gsx.backbones.mip import absorb, filter_named
 from gsx.backbones.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
-from gsx.backbones.sh_degrees import Judged, hold_bands, judged, lower_degrees, numbers_of
+from gsx.backbones.sh_degrees import ChosenDegrees, choose_degrees, hold_bands, lower_degrees, numbers_of
 from gsx.backbones.sky import NOTHING, SKY_OPACITY, WIDEST, far_away, sky_behind
+from gsx.backbones.visibility import Shown, Visibility, everything, extents
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud, View
 from gsx.core.data.window import Window
@@ -40,7 +39,7 @@ from gsx.formats.splat_files import columns_of
 
 
 def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> dict[str, Tensor]:
-    """Raw parameters of one Gaussian per point (3D-GS, create_from_pcd and simple-knn)."""
+    """Returns raw parameters of one Gaussian per point (3D-GS, create_from_pcd and simple-knn)."""
     positions, count = points.positions.float(), len(points)
     distance = mean_square_distance(positions).clamp_min(LEAST_SQUARE_DISTANCE)
     return {
@@ -54,7 +53,7 @@ def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> di
 
 
 def raw_parameters(gaussians: Gaussians, sh_degree: int) -> dict[str, Tensor]:
-    """Raw parameters of Gaussians with colours of that degree; bands that they lack are zero.
+    """Returns raw parameters of Gaussians with colours of that degree; bands that they lack are zero.
 
     Raises:
         InputError: they have more bands.
@@ -70,49 +69,46 @@ def raw_parameters(gaussians: Gaussians, sh_degree: int) -> dict[str, Tensor]:
 def colours_from(
     camera: Camera, values: Mapping[str, Tensor], degree: int, compiled: bool = False
 ) -> Float[Tensor, "M 3"]:
-    """Colours of Gaussians as seen from a camera, up to a degree."""
+    """Evaluates colours of Gaussians as seen from a camera, up to a degree."""
     offsets = offsets_from(values["means"], camera.centre)
     return colours_of(values["sh_dc"], values["sh_rest"], offsets, degree, compiled)
 
 
 def gs3d(options: GS3DOptions, context: BackboneContext) -> "GS3D":
-    """The backbones gs3d, gs3d_zoom and mip_splatting."""
-    how = CloneSplit() if options.capacity == "published" else LongAxis(options.looks)
-    return GS3D(options, context, AllVisible(), how)
+    """Builds the backbones gs3d, gs3d_zoom and mip_splatting."""
+    control = (CloneSplit if options.capacity == "published" else LongAxis)(options, context)
+    return GS3D(options, context, Visibility(), control)
 
 
 class GS3D:
     """Explicit Gaussians, N rows in every parameter."""
 
     def __init__(
-        self, options: GS3DOptions, context: BackboneContext, visibility: Visibility, densification: Densification
+        self, options: GS3DOptions, context: BackboneContext, visibility: Visibility, control: DensityControl
     ) -> None:
-        density, scene = options.density, context.scene
-        self.options, self.visibility, self.extent, self.context = options, visibility, scene.extent, context
-        self.schedule = context.schedule(options.published_iterations)
-        self.capacity = capacity_of(options, context, growing_of(density, self.schedule))
-        self.control = DensityControl(density, self.capacity, context, self.schedule, densification)
-        self.filter = filter_named(options.filter, options.mip, context, self.schedule, self.control.ends())
+        self.options, self.context, self.visibility, self.control = options, context, visibility, control
+        self.extent, self.schedule, self.capacity = context.scene.extent, control.schedule, control.capacity
+        self.filter = filter_named(options.filter, options.mip, context, self.schedule, control.events.stop)
         self.raster = self.filter.rules(context.raster)
-        self.absolute_gradient = density.absolute or self.capacity.ranked
+        self.absolute_gradient = options.density.absolute or self.capacity.ranked
         self.first_degree, self.sh_degree = 0, options.sh_degree
         self.table = self.initial_table(context.points(), context.device)
         self.filter.refresh(self.table, self.table["means"])
 
     def initial_table(self, points: PointCloud, device: torch.device) -> ParameterTable:
-        """A Gaussian for each point that visibility starts from, and for each of the sky, if there is one."""
+        """Builds a Gaussian for each point that visibility starts from, and for each of the sky, if there is one."""
         points, columns = self.visibility.start(points)
         raw = initial_parameters(points, self.options.sh_degree, self.options.initial_opacity)
         if self.options.sky != "never":
             sky = sky_behind(self.context.scene, self.options.sky) if self.context.begins else NOTHING
-            own = initial_parameters(sky.points, self.options.sh_degree, SKY_OPACITY)
-            own["log_scales"].clamp_(math.log(sky.spacing), math.log(WIDEST * sky.spacing))
-            raw = {name: torch.cat([value, own[name]]) for name, value in raw.items()}
+            behind = initial_parameters(sky.points, self.options.sh_degree, SKY_OPACITY)
+            behind["log_scales"].clamp_(math.log(sky.spacing), math.log(WIDEST * sky.spacing))
+            raw = {name: torch.cat([value, behind[name]]) for name, value in raw.items()}
             columns = columns | {"sky": (torch.arange(len(raw["means"])) >= len(points)).to(torch.int8)}
         return self.table_of(raw, columns, device)
 
     def table_of(self, raw: dict[str, Tensor], columns: dict[str, Tensor], device: torch.device) -> ParameterTable:
-        """A table of raw parameters and columns that nothing is known of yet."""
+        """Builds a table of raw parameters and columns, with empty statistics."""
         if self.options.sh_judged > 0:
             degrees = torch.full((len(raw["means"]),), self.options.sh_degree, dtype=torch.int8)
             columns = columns | {"sh_degree": degrees}
@@ -120,17 +116,18 @@ class GS3D:
             {name: Parameter(value.to(device)) for name, value in raw.items()},
             {name: value.to(device) for name, value in columns.items()},
             gradient_statistics(len(raw["means"]), device, self.absolute_gradient),
+            former_names={"sh_dc": "sh_constant"},
         )
-        self.capacity.begin(table)
+        self.capacity.initialise(table)
         return table
 
     def go_on_from(self, gaussians: Gaussians) -> None:
-        """Take Gaussians of a file, which are drawn as they are: what the 3D filter adds is taken off them first.
+        """Takes Gaussians of a file, which are drawn as they are: it first takes off what the 3D filter adds.
 
         Raises:
             InputError: they have more bands of colour than the model, or the model has levels, which no file tells.
         """
-        if not isinstance(self.visibility, AllVisible):
+        if self.visibility.by_level:
             raise InputError("init: a splat file says nothing of levels: choose backbone=gs3d or mip_splatting")
         raw, device = raw_parameters(gaussians, self.options.sh_degree), self.table["means"].device
         self.first_degree = self.options.sh_degree
@@ -148,12 +145,12 @@ class GS3D:
     # -- one step, in the order the trainer calls --------------------------------------------------------------
 
     def active_degree(self, step: int) -> int:
-        """SH degree at a step (3D-GS, sh_utils.py)."""
+        """Returns the SH degree at a step (3D-GS, sh_utils.py)."""
         grown = step // max(1, self.schedule.step(self.options.sh_every))
         return max(self.first_degree, min(self.options.sh_degree, grown))
 
     def draw(self, camera: Camera, step: int) -> DrawnSplats:
-        """The Gaussians that the camera draws, with their colours as seen from there."""
+        """Returns the Gaussians that the camera draws, with their colours as seen from there."""
         shown = self.visibility.shown(self.table, camera, step)
         values = shown.values
         scales, log_opacities = extents(self.table, shown, self.filter)
@@ -168,73 +165,73 @@ class GS3D:
         return DrawnSplats(splats=splats, rows=shown.rows)
 
     def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
-        """That of density control; 3D-GS has none."""
-        return self.control.densification.regulariser(drawn)
+        """Returns that of density control; 3D-GS has none."""
+        return self.control.regulariser(drawn)
 
     def observe(self, drawn: DrawnSplats, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
-        """Screen gradients, which count until density control ends (3D-GS, train.py)."""
-        if step >= self.control.ends():
+        """Returns screen gradients, which count until density control ends (3D-GS, train.py)."""
+        if step >= self.control.events.stop:
             return {}
         return densification_statistics(rendering.screen, drawn.rows, weight)
 
-    def accumulate(self, seen: Observation) -> None:
-        """Add screen gradients to the statistics."""
-        if seen:
-            add_statistics(self.table, seen)
+    def accumulate(self, observation: Observation) -> None:
+        """Adds screen gradients to the statistics."""
+        if observation:
+            add_statistics(self.table, observation)
 
     def validation_window(self, view: View, step: int) -> Window | None:
-        """What capacity is judged by."""
+        """Returns the window that capacity is measured by."""
         return self.capacity.validation_window(self.table, view, step)
 
     def pseudo_views_made(self, views: Sequence[PseudoView], step: int) -> None:
-        """Tells the filter."""
+        """Hands new pseudo views to the filter."""
         self.filter.pseudo_views_made(views)
 
     def densify_and_prune(self, step: int) -> dict[str, float]:
-        """Clear once, clone, split, prune and reset when due."""
-        done = self.capacity.clear(self.table, self.table["means"]) if step == 1 else {}
-        done |= self.control.densify(self, step) if self.control.due(step) else {}
-        if done or self.filter.due(step):
+        """Removes rows in empty space once; clones, splits, prunes and resets when due."""
+        metrics = self.capacity.remove_empty(self.table, self.table["means"]) if step == 1 else {}
+        metrics |= self.control.densify(self, step) if self.control.events.due(step) else {}
+        if metrics or self.filter.due(step):
             before = self.table.columns.get("filter")
             self.filter.refresh(self.table, self.table["means"], step)
             if before is not None and self.filter.narrows(step):  # the picture goes on as it was
                 absorb(self.table, before, self.table["filter"])
         if self.control.reset_due(step):
             self.control.reset_opacities(self.table, self.filter)
-            done["opacity_resets"] = 1
+            metrics["opacity_resets"] = 1
         if step == self.sh_step():
-            done |= self.judge_degrees(step)
-        return done
+            metrics |= self.choose_degrees(step)
+        return metrics
 
     def settles(self) -> list[int]:
-        """When density control ends, and colours are judged."""
-        return [self.control.ends(), self.sh_step()]
+        """Returns when density control ends, and when SH degrees are chosen."""
+        return [self.control.events.stop, self.sh_step()]
 
     def sh_step(self) -> int:
-        """Step at which SH degrees are judged; 0: at none."""
+        """Returns the step at which SH degrees are chosen; 0: at none."""
         return round(self.options.sh_judged * self.schedule.iterations)
 
-    def judge_degrees(self, step: int) -> dict[str, float]:
-        """Keep the bands of colour that training views tell are worth their numbers."""
+    def choose_degrees(self, step: int) -> dict[str, float]:
+        """Keeps the bands of colour that change renders of training views by more than their price."""
         highest, context, price = self.active_degree(step), self.context, self.options.sh_price
         if not highest:
             return {}
         other = sum(value[0].numel() for name, value in self.table.parameters.items() if not name.startswith("sh_"))
-        views = random_views(context.views.at(step), LOOKS, context.generator)
+        views = random_views(context.views.at(step), MOST_VIEWS, context.generator)
 
-        def estimate() -> Judged:
+        def estimate() -> ChosenDegrees:
             probe = Probe(model=self, views=context.views, step=step)
             fits = colour_fits(probe, views, context.generator, highest - 1)
-            return judged(fits, price, numbers_of(highest, other)).to("cpu")
+            return choose_degrees(fits, price, numbers_of(highest, other)).to("cpu")
 
         return lower_degrees(self.table, context.on_rank0(estimate).to(context.device), step, price)
 
     def means_rate_steps(self) -> int:
-        """Step at which the learning rate of the means has come down."""
+        """Returns the step at which the learning rate of the means has come down."""
         return self.schedule.step(self.options.decay_until or self.options.published_iterations)
 
     def set_rates(self, step: int) -> None:
-        """Learning rates of a step (3D-GS, arguments)."""
+        """Sets the learning rates of a step (3D-GS, arguments)."""
         rates, faster = self.options.rates, self.schedule.shortened(self.options.rates.shortened)
         of_means = log_linear(step, self.means_rate_steps(), faster * rates.means_first, rates.means_last)
         self.table.set_rate("means", self.extent * of_means)
@@ -243,7 +240,7 @@ class GS3D:
             self.table.set_rate(name, faster * getattr(rates, name))
 
     def update(self, step: int) -> None:
-        """One Adam step. Unused SH bands take part with zero gradients, as in the published code (3D-GS)."""
+        """Takes one Adam step. Unused SH bands take part with zero gradients, as in the published code (3D-GS)."""
         rest = self.table["sh_rest"]
         if rest.grad is None and self.table["sh_dc"].grad is not None:
             rest.grad = torch.zeros_like(rest)
@@ -260,12 +257,12 @@ class GS3D:
     # -- files and logs ----------------------------------------------------------------------------------------
 
     def explicit(self, camera: Camera | None, step: int) -> Gaussians:
-        """What `gaussians` makes of what the camera draws; without a camera of all Gaussians."""
+        """Returns Gaussians of a splat file: those the camera draws, without a camera all."""
         shown = everything(self.table) if camera is None else self.visibility.shown(self.table, camera, step)
         return self.gaussians(shown)
 
     def gaussians(self, shown: Shown) -> Gaussians:
-        """Parameters as a splat file holds them, the 3D filter fused into scales and opacities (Mip-Splatting)."""
+        """Returns parameters as in a splat file, the 3D filter fused into scales and opacities (Mip-Splatting)."""
         raw = {name: shown.values[name].detach() for name in self.table.parameters}
         if self.filter.note or shown.weights is not None:
             scales, log_opacities = extents(self.table, shown, self.filter)
@@ -275,16 +272,16 @@ class GS3D:
         return Gaussians(**raw)
 
     def slot_count(self) -> int:
-        """One of each Gaussian."""
+        """Returns the number of Gaussians."""
         return len(self.table)
 
     def slots(self, drawn: DrawnSplats) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"]]:
-        """Rows of the table."""
+        """Returns rows of the table."""
         rows = torch.arange(len(self.table), device=self.table["means"].device) if drawn.rows is None else drawn.rows
         return rows, rows
 
     def file_columns(self) -> dict[str, Tensor] | None:
-        """The standard 62 properties (3D-GS, save_ply) with further columns of visibility where normals would be."""
+        """Returns the standard 62 properties (3D-GS, save_ply), with columns of visibility where normals would be."""
         more = self.visibility.columns(self.table)
         if not more:
             return None
@@ -293,11 +290,11 @@ class GS3D:
         return {axis: columns[axis] for axis in "xyz"} | more | rest
 
     def file_notes(self) -> list[str]:
-        """Whether the 3D filter is in the file, and what visibility has to say."""
+        """Returns whether the 3D filter is in the file, and notes of visibility."""
         return [self.filter.note or "no 3D filter", *self.visibility.notes()]
 
     def plan(self) -> dict[str, Any]:
-        """The schedule in steps of this run."""
+        """Returns the schedule in steps of this run."""
         rates = self.options.rates
         return {
             **self.control.plan(),

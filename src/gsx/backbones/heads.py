@@ -42,7 +42,7 @@ class HeadOptions:
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
-    """A layer with torch's default initial distribution, drawn from `generator`."""
+    """Builds a layer with torch's default initial distribution, drawn from `generator`."""
     layer, bound = nn.utils.skip_init(nn.Linear, inputs, outputs), 1 / math.sqrt(inputs)
     with torch.no_grad():
         layer.weight.uniform_(-bound, bound, generator=generator)
@@ -51,14 +51,14 @@ def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
 
 
 def head(inputs: int, width: int, outputs: int, last: nn.Module, generator: torch.Generator) -> nn.Sequential:
-    """One hidden layer with ReLU."""
+    """Builds a network with one hidden layer and ReLU."""
     return nn.Sequential(
         linear(inputs, width, generator), nn.ReLU(inplace=True), linear(width, outputs, generator), last
     )
 
 
 def tiled(feature: Float[Tensor, "A C"], stride: int) -> Float[Tensor, "A C"]:
-    """Every `stride`-th value, the whole sub-vector repeated (not each value)."""
+    """Takes every `stride`-th value and repeats the whole sub-vector (not each value)."""
     return feature[:, ::stride].repeat(1, stride)
 
 
@@ -93,7 +93,7 @@ class Heads(nn.Module):
         level: Float[Tensor, "A 1"],
         view: int,
     ) -> tuple[Float[Tensor, "A k"], Float[Tensor, "A k 7"], Float[Tensor, "A k 3"]]:
-        """(opacities in (-1, 1), raw scales and quaternions, colours in (0, 1)).
+        """Returns (opacities in (-1, 1), raw scales and quaternions, colours in (0, 1)).
 
         `offset` is anchor minus camera centre, world units; `view` the number of a training view, or -1.
         """
@@ -104,23 +104,23 @@ class Heads(nn.Module):
         if o.bank:
             feature = self.mixed(feature, [direction, *([distance] if o.bank_distance else []), *extra])
 
-        def seen(with_distance: bool, *more: Tensor) -> Tensor:
+        def inputs(with_distance: bool, *more: Tensor) -> Tensor:
             return torch.cat([feature, direction, *([distance] if with_distance else []), *extra, *more], 1)
 
         code = [self.code(view).expand(len(feature), -1)] if o.appearance else []
         return (
-            self.opacity(seen(o.opacity_distance)),
-            self.covariance(seen(o.covariance_distance)).view(-1, self.offsets, 7),
-            self.colour(seen(o.colour_distance, *code)).view(-1, self.offsets, 3),
+            self.opacity(inputs(o.opacity_distance)),
+            self.covariance(inputs(o.covariance_distance)).view(-1, self.offsets, 7),
+            self.colour(inputs(o.colour_distance, *code)).view(-1, self.offsets, 3),
         )
 
     def mixed(self, feature: Float[Tensor, "A C"], inputs: list[Tensor]) -> Float[Tensor, "A C"]:
-        """Features at three resolutions, weighted by view."""
+        """Mixes features at three resolutions, weighted by view."""
         weights = self.bank(torch.cat(inputs, 1))
         parts = (tiled(feature, 4), tiled(feature, 2), feature)
         return sum((weights[:, i : i + 1] * part for i, part in enumerate(parts)), start=torch.zeros_like(feature))
 
     def code(self, view: int) -> Float[Tensor, "A"]:
-        """The appearance code of a training view, or the one chosen for all other cameras."""
+        """Returns the appearance code of a training view, or the one chosen for all other cameras."""
         number = view if view >= 0 else self.options.appearance_code
         return self.appearance.weight[number] if number >= 0 else self.appearance.weight.mean(0)

@@ -59,13 +59,13 @@ class LevelOptions:
         self.demand("visible_threshold", threshold == -1 or 0 <= threshold < 1, "give -1, or from 0 to below 1")
 
     def demand(self, name: str, met: bool, advice: str) -> None:
-        """Refuse a value that does not meet a condition."""
+        """Refuses a value that does not meet a condition."""
         if not met:
             raise ValueError(f"backbone.levels.{name} is {getattr(self, name)!r}; {advice}")
 
 
 def faithful(options: LevelOptions | None, fidelity: str) -> LevelOptions | None:
-    """The options, with the switches of the reference's quirks that they leave open as the fidelity has them."""
+    """Returns the options with open switches of the reference's quirks set by the fidelity."""
     if options is None:
         return None
     half_cell = fidelity == "reference" if options.half_cell is None else options.half_cell
@@ -73,7 +73,7 @@ def faithful(options: LevelOptions | None, fidelity: str) -> LevelOptions | None
 
 
 def checked_end(options: LevelOptions | None, published: int) -> None:
-    """Refuse a schedule that ends with levels that never took part in training."""
+    """Refuses a schedule that ends with levels that never took part in training."""
     if options is not None and options.coarse_until >= published:
         raise ValueError(
             f"backbone.levels.coarse_until is {options.coarse_until}, and the published run "

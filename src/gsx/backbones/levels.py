@@ -1,9 +1,7 @@
 """Levels of detail over any representation: which primitives a camera at a given distance sees (Octree-GS).
 
 Level 0 is the coarsest; a camera at distance d draws every level up to log_f(D / (s d)): coarse levels always, finer
-ones are added. There are no pointers between levels, only nested grids with cells of v / f^L. Everything is a function
-of positions and levels and runs on the device of the positions; a backbone holds the level and the bias of each of its
-primitives and asks.
+ones are added. There are no pointers between levels, only nested grids with cells of v / f^L.
 """
 
 import math
@@ -35,13 +33,13 @@ FLOAT_STEP = 2.0**-23
 
 
 def all_levels_from(options: LevelOptions, schedule: Schedule) -> int:
-    """Step of this run at which all levels take part: before its last one, however short it is; 0: from the start."""
+    """Returns the step at which all levels take part: before the last one, however short the run; 0: from the start."""
     return min(schedule.step(options.coarse_until), schedule.iterations - 1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Viewpoints:
-    """Where the training cameras stand, and how coarsely each samples."""
+    """Places of the training cameras, and how coarsely each samples."""
 
     centres: Float[Tensor, "V 3"]
     """World, float64."""
@@ -52,7 +50,7 @@ class Viewpoints:
 
 
 def viewpoints_of(cameras: Sequence[Camera]) -> Viewpoints:
-    """The training cameras as levels of detail see them."""
+    """Returns places and coarseness of the training cameras."""
     focal = max(camera.fx for camera in cameras)
     return Viewpoints(
         centres=torch.stack([camera.centre.double() for camera in cameras]),
@@ -106,38 +104,38 @@ class Levels:
         return self.cell * self.views.focal / self.farthest
 
     def size(self, level: int) -> float:
-        """Cell length of one level, scene units."""
+        """Returns the cell length of one level, scene units."""
         return self.box / float(self.fork) ** (self.base_layer + level)
 
     def cell_of(self, levels: Int[Tensor, "M"]) -> Float[Tensor, "M"]:
-        """Cell length of each primitive's level, scene units."""
+        """Returns the cell length of each primitive's level, scene units."""
         return self.cell / float(self.fork) ** levels.float()
 
     def cells(self, positions: Float[Tensor, "M 3"], level: int) -> Int[Tensor, "M 3"]:
-        """The nearest node of a level's grid, halves to even."""
+        """Returns the nearest node of a level's grid, halves to even."""
         return ((positions.double() - self.origin) / self.size(level)).round().long()
 
     def nodes(self, cells: Int[Tensor, "M 3"], level: int) -> Float[Tensor, "M 3"]:
-        """World positions of nodes, float32."""
+        """Returns world positions of nodes, float32."""
         return (cells.double() * self.size(level) + self.origin).float()
 
     def highest(self, step: int) -> int:
-        """Highest level that takes part at a step (Octree-GS, set_coarse_interval)."""
+        """Returns the highest level that takes part at a step (Octree-GS, set_coarse_interval)."""
         return min(self.count - 1, unlocked(self.switches, self.first, step))
 
     def coarseness(self, camera: Camera) -> float:
-        """Focal length of the finest training camera over this one's; at least 1 where levels end with training."""
+        """Returns the finest training focal length over this camera's; at least 1 where levels end with training."""
         ratio = self.views.focal / camera.fx
         return max(1.0, ratio) if self.zoom == "training" else ratio
 
     def ideal(self, distances: Float[Tensor, "M"], coarseness: float) -> Float[Tensor, "M"]:
-        """L* = log_f(D / (s d)), finite everywhere (Octree-GS, set_anchor_mask)."""
+        """Returns L* = log_f(D / (s d)), finite everywhere (Octree-GS, set_anchor_mask)."""
         nearness = self.farthest / (coarseness * distances).clamp_min(LEAST_DISTANCE * self.farthest)
         return nearness.log2() / math.log2(self.fork)
 
 
 def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: LevelOptions, until: int) -> Levels:
-    """The levels of a scene from its points and training cameras (Octree-GS).
+    """Derives the levels of a scene from its points and training cameras (Octree-GS).
 
     `until`: step of this run at which all levels take part, `options.coarse_until` rescaled; 0: from the start.
     """
@@ -167,39 +165,41 @@ def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: Lev
 
 
 def distance_range(points: Float[Tensor, "P 3"], views: Viewpoints, fraction: float) -> tuple[float, float]:
-    """(near, far) distances between cameras and points, in units of the finest camera (Octree-GS, set_level)."""
-    found = []
+    """Returns (near, far) distances between cameras and points, in units of the finest one (Octree-GS, set_level)."""
+    listed = []
     for centre, coarseness in zip(views.centres, views.coarseness.tolist(), strict=True):
         distances = offsets_from(points, centre).norm(dim=1)
-        found += [coarseness * quantile(distances, q) for q in (fraction, 1 - fraction)]
-    listed = torch.tensor(found, dtype=torch.float64)
-    return quantile(listed, 1 - fraction), quantile(listed, fraction)
+        listed += [coarseness * quantile(distances, q) for q in (fraction, 1 - fraction)]
+    quantiles = torch.tensor(listed, dtype=torch.float64)
+    return quantile(quantiles, 1 - fraction), quantile(quantiles, fraction)
 
 
 def level_count(near: float, far: float, fork: int) -> int:
-    """K: as many levels as the range of distances has forks (Octree-GS, set_level); 1 where every distance is 0."""
+    """Returns as many levels as the range of distances has forks (Octree-GS, set_level); 1 if all are 0."""
     if far == 0:
         return 1
     return round(math.log(far / max(near, LEAST_DISTANCE * far), fork)) + 1
 
 
 def box_of(points: Float[Tensor, "P 3"], extend: float, rule: str) -> tuple[float, float]:
-    """(lowest coordinate, length) of the cube around the points, one range for all axes (Octree-GS, octree_sample)."""
+    """Returns (lowest coordinate, length) of the cube around the points (Octree-GS, octree_sample)."""
     low, high = float(points.min()), float(points.max())
     start = extend * low if rule == "reference" else low - (extend - 1) / 2 * (high - low)
     return start, extend * (high - low)
 
 
 def first_level(count: int, given: int, until: int) -> int:
-    """Highest level at the start: given, or -1 for half of them (Octree-GS, set_level); all where none is to wait."""
+    """Returns the highest level at the start: -1 for half of them (Octree-GS, set_level); all if none waits."""
     if until < 1:
         return count - 1
     return min(count // 2 if given == -1 else given, count - 1)
 
 
 def base_layer(box: float, count: int, options: LevelOptions, pixels: float) -> int:
-    """Forks from the box to a cell of level 0: given, or such that level K/2 - 1 has cells of `voxel` (Octree-GS); no
-    more than leave a cell `cell_pixels`, `pixels` being those of a unit of length at the farthest."""
+    """Returns forks from the box to a cell of level 0: given, or such that level K/2 - 1 has cells of `voxel`.
+
+    No more than leave a cell `cell_pixels`; `pixels`: of a unit of length at the farthest. Source: Octree-GS.
+    """
     chosen = options.base_layer
     if chosen < 0:
         chosen = round(math.log(box / options.voxel, options.fork)) - count // 2 + 1
@@ -209,10 +209,7 @@ def base_layer(box: float, count: int, options: LevelOptions, pixels: float) -> 
 
 
 def mean_seen(points: Float[Tensor, "P 3"], levels: Levels) -> float:
-    """The adaptive threshold: mean fraction of cameras that draw a node, over all nodes of all levels (Octree-GS).
-
-    Held below 1, where every camera draws every node, so that those are kept.
-    """
+    """Returns the adaptive threshold: mean fraction of cameras that draw a node (Octree-GS), held below 1."""
     positions, of, _ = all_nodes(points, levels)
     return min(float(seen_fraction(levels, positions, of).double().mean()), BELOW_ONE)
 
@@ -220,7 +217,7 @@ def mean_seen(points: Float[Tensor, "P 3"], levels: Levels) -> float:
 def all_nodes(
     points: Float[Tensor, "P 3"], levels: Levels
 ) -> tuple[Float[Tensor, "C 3"], Int[Tensor, "C"], Int[Tensor, "K P"]]:
-    """(positions, level, group) of the nodes nearest to the points on every level, coarse to fine (Octree-GS)."""
+    """Returns (positions, level, group) of the nodes nearest to the points, level by level (Octree-GS)."""
     positions, of, group, total = [], [], [], 0
     for level in range(levels.count):
         cells, place = new_cells(levels.cells(points, level), torch.empty(0, 3, dtype=torch.long, device=points.device))
@@ -234,7 +231,7 @@ def all_nodes(
 def initial_nodes(
     points: Float[Tensor, "P 3"], levels: Levels
 ) -> tuple[Float[Tensor, "N 3"], Int[Tensor, "N"], Int[Tensor, "K P"]]:
-    """(positions, level, group) of the nodes a scene starts from: those that enough cameras draw (Octree-GS).
+    """Returns (positions, level, group) of the nodes a scene starts from: those enough cameras draw (Octree-GS).
 
     Level is int16. `group[L, p]` is the row of the node of point p on level L, -1 if it was left out, so that
     `pooled_max(colours.repeat(K, 1), group.flatten(), N)` are the largest colours in each cell.
@@ -246,7 +243,7 @@ def initial_nodes(
 
 
 def whole_level(ideal: Float[Tensor, "M"], mode: str, highest: int) -> tuple[Int[Tensor, "M"], Float[Tensor, "M"]]:
-    """(highest level drawn, weight of its opacities) for each primitive (Octree-GS)."""
+    """Returns (highest level drawn, weight of its opacities) for each primitive (Octree-GS)."""
     if mode == "progressive":
         place = (ideal + 1).clamp(BELOW_ONE, highest + BELOW_ONE)
         return place.floor().long(), place - place.floor()
@@ -255,7 +252,7 @@ def whole_level(ideal: Float[Tensor, "M"], mode: str, highest: int) -> tuple[Int
 
 
 def seen_fraction(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) -> Float[Tensor, "M"]:
-    """Fraction of the training cameras that would draw each primitive, by distance alone (Octree-GS, weed_out)."""
+    """Returns the share of training cameras that would draw each primitive, by distance (Octree-GS, weed_out)."""
     views, counts = levels.views, torch.zeros_like(positions[:, 0])
     for centre, coarseness in zip(views.centres, views.coarseness.tolist(), strict=True):
         ideal = levels.ideal(offsets_from(positions, centre).norm(dim=1), coarseness)
@@ -264,7 +261,7 @@ def seen_fraction(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tenso
 
 
 def kept(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) -> Bool[Tensor, "M"]:
-    """Primitives that enough training cameras draw (Octree-GS, weed_out); none without a finite place."""
+    """Marks primitives that enough training cameras draw (Octree-GS, weed_out); none without a finite place."""
     placed = torch.isfinite(positions).all(1)
     places = torch.where(placed[:, None], positions, 0.0)
     return (seen_fraction(levels, places, of) > levels.threshold) & placed
@@ -278,10 +275,9 @@ def drawn(
     camera: Camera,
     highest: int,
 ) -> tuple[Bool[Tensor, "N"], Float[Tensor, "N"]]:
-    """(mask, weight): primitives whose level the camera draws, and how much of their opacity (Octree-GS).
+    """Returns (mask, weight): primitives whose level the camera draws, and factors of their opacities (Octree-GS).
 
-    `bias` is added to the level each primitive asks for; `highest` is the finest level in use, K - 1 outside training.
-    Neither result carries gradients.
+    `bias` is added to each primitive's level; `highest`: finest level in use, K - 1 outside training. No gradients.
     """
     shift = levels.cell_of(of)[:, None] / 2 if levels.half_cell else 0.0
     distances = (offsets_from(positions.detach(), camera.centre) + shift).norm(dim=1)
@@ -292,25 +288,25 @@ def drawn(
 
 
 def switch_points(count: int, first: int, until: int, factor: float) -> tuple[int, ...]:
-    """Steps at which the levels above `first` join, each interval shorter than the last (Octree-GS)."""
+    """Returns steps at which the levels above `first` join, each interval shorter than the last (Octree-GS)."""
     intervals = count - 1 - first
     lengths = [factor**-n for n in range(intervals)]
     return tuple(int(until * sum(lengths[: n + 1]) / sum(lengths) + 0.5) for n in range(intervals))
 
 
 def unlocked(switches: Sequence[int], first: int, step: int) -> int:
-    """Highest level in training at a step: `first`, and one more after each switch point (Octree-GS)."""
+    """Returns the highest level at a step: `first`, and one more after each switch point (Octree-GS)."""
     return first + sum(switch < step for switch in switches)
 
 
 def thresholds(base: float, fork: int, update_ratio: float, count: int) -> tuple[float, ...]:
-    """Gradient at which a primitive of each level grows: tau_L = base f^(update_ratio L) (Octree-GS)."""
+    """Returns gradients at which a primitive of each level grows: tau_L = base f^(update_ratio L) (Octree-GS)."""
     return tuple(base * fork ** (update_ratio * level) for level in range(count))
 
 
-def facts_of(levels: Levels, of: Int[Tensor, "N"] | None = None) -> dict[str, Any]:
-    """The numbers of the levels, lengths in scene units, to be printed; with `of`, primitives per level too."""
-    facts = {
+def facts_of(levels: Levels, of: Int[Tensor, "N"]) -> dict[str, Any]:
+    """Returns the numbers of the levels, lengths in scene units, with the primitives of each."""
+    return {
         "levels": levels.count,
         "nearest": levels.nearest,
         "farthest": levels.farthest,
@@ -322,14 +318,12 @@ def facts_of(levels: Levels, of: Int[Tensor, "N"] | None = None) -> dict[str, An
         "first_level": levels.first,
         "switch_points": list(levels.switches),
         "threshold": levels.threshold,
+        "anchors": of.long().bincount(minlength=levels.count).tolist(),
     }
-    if of is None:
-        return facts
-    return facts | {"anchors": of.long().bincount(minlength=levels.count).tolist()}
 
 
 def note_of(levels: Levels) -> str:
-    """A file's comment: what a viewer must know to choose levels at a distance (Octree-GS, save_ply)."""
+    """Returns a file's comment: what a viewer must know to choose levels at a distance (Octree-GS, save_ply)."""
     return (
         f"levels {levels.count}, fork {levels.fork}, standard_dist {levels.farthest!r} at a focal length of "
         f"{levels.views.focal!r} px, init_pos {levels.origin!r}, voxel_size {levels.cell!r}"
@@ -337,10 +331,10 @@ def note_of(levels: Levels) -> str:
 
 
 def warnings_of(levels: Levels, anchors: int) -> list[str]:
-    """What is odd about the levels of a scene that starts with so many primitives, with the numbers that tell."""
+    """Returns warnings about the levels of a scene that starts with so many primitives, with the numbers."""
     finest, near, far = levels.size(levels.count - 1), levels.nearest, levels.farthest
     step = FLOAT_STEP * max(abs(levels.origin), abs(levels.origin + levels.box))
-    found = {
+    warnings = {
         f"{levels.count} levels are more than {MANY_LEVELS}, for distances from {near:.3g} to {far:.3g}: set "
         "backbone.levels.count or lower backbone.levels.distance_quantile": levels.count > MANY_LEVELS,
         f"the nearest points are {near:.3g} from a camera, the farthest {far:.3g}: points at cameras add levels; "
@@ -353,4 +347,4 @@ def warnings_of(levels: Levels, anchors: int) -> list[str]:
         f"{anchors} primitives to start from are more than {MANY_ANCHORS}: lower backbone.levels.base_layer, or "
         "raise backbone.levels.visible_threshold": anchors > MANY_ANCHORS,
     }
-    return [warning for warning, true in found.items() if true]
+    return [warning for warning, holds in warnings.items() if holds]

@@ -1,23 +1,22 @@
 """Splits along the longest axis: two halves side by side in the place of one Gaussian (Improved-GS)."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsx.backbones.capacity import to_look_at
+from gsx.backbones.capacity import frozen_table
 from gsx.backbones.density import mean_absolute, within_room
+from gsx.backbones.density_control import DensityControl, replace_rows
+from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.merging import covariances, principal_axes
 from gsx.backbones.sky import not_sky
 from gsx.core.gaussians.quaternions import rotation_matrices
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.backbone import Backbone, DrawnSplats
+from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.importance import Probe, random_views
-from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows, keep_rows
-
-if TYPE_CHECKING:
-    from gsx.backbones.density_control import DensityControl
+from gsx.core.training.parameter_table import ParameterTable, detached_rows
 
 STEP, LENGTH, OPACITY = 1.35, 0.55, 0.6
 """Of the halves: distance from the whole's centre and length, times its largest scale; share of its opacity."""
@@ -27,8 +26,7 @@ LARGEST_OPACITY = 1 - 1e-6
 
 
 def halves(rows: dict[str, Tensor]) -> list[dict[str, Tensor]]:
-    """Two halves of each Gaussian, given by raw parameters, on either side of its centre along its longest axis
-    (Improved-GS, long-axis split)."""
+    """Returns two halves of each Gaussian, on either side of its centre along its longest axis (Improved-GS)."""
     longest = rows["log_scales"].argmax(1, keepdim=True)
     along = torch.zeros_like(rows["log_scales"]).scatter_(1, longest, 1.0)
     size = rows["log_scales"].gather(1, longest).exp()
@@ -41,7 +39,7 @@ def halves(rows: dict[str, Tensor]) -> list[dict[str, Tensor]]:
 
 
 def wholes(first: dict[str, Tensor], second: dict[str, Tensor]) -> dict[str, Tensor]:
-    """One Gaussian for each two: of fresh halves what they were made from, of others what would be split into the like.
+    """Returns one Gaussian for each two: of fresh halves what they were made from.
 
     Means of both, and covariances of both with what their distance adds, less what a split adds.
     """
@@ -60,39 +58,35 @@ def wholes(first: dict[str, Tensor], second: dict[str, Tensor]) -> dict[str, Ten
 
 
 def split_along(table: ParameterTable, chosen: Bool[Tensor, "N"]) -> None:
-    """Two halves in the place of each chosen row: survivors, first halves, second halves."""
+    """Changes rows to survivors, first halves, second halves of the chosen ones."""
     twins = halves({name: value[chosen] for name, value in detached_rows(table).items()})
-    append_rows(table, {name: torch.cat([twin[name] for twin in twins]) for name in twins[0]})
-    new = torch.ones(len(table) - len(chosen), dtype=torch.bool, device=chosen.device)
-    keep_rows(table, torch.cat([~chosen, new]))
+    replace_rows(table, chosen, {name: torch.cat([twin[name] for twin in twins]) for name in twins[0]})
 
 
 def twins_of(born: Float[Tensor, "N"]) -> tuple[Int[Tensor, "P"], Int[Tensor, "P"]]:
-    """(rows of first halves, of second ones) of the pairs of which both are still there, by the numbers they bear."""
+    """Returns (rows of first halves, of second ones) of the pairs of which both are left, by their numbers."""
     order = born.argsort(stable=True)
     number = born[order]
     paired = ((number[:-1] == number[1:]) & (number[1:] > 0)).nonzero()[:, 0]
     return order[paired], order[paired + 1]
 
 
-class LongAxis:
+class LongAxis(DensityControl):
     """The Gaussians that draw most of the error, and whose pixels pull at them the most, become two halves each."""
 
-    resets = False
+    def __init__(self, options: GS3DOptions, context: BackboneContext) -> None:
+        super().__init__(options, context)
+        self.views = options.looks
 
-    def __init__(self, views: int) -> None:
-        self.views = views
-
-    def densify(self, control: "DensityControl", model: Backbone[Any], step: int) -> dict[str, float]:
-        """As many as there is room for."""
-        table = model.table
-        context = control.context
-        views = random_views(context.views.at(step), self.views, control.generator)
+    def add(self, model: Backbone[Any], step: int) -> dict[str, float]:
+        """Splits as many as there is room for."""
+        table, context = model.table, self.context
+        views = random_views(context.views.at(step), self.views, self.generator)
         probe = Probe(model=model, views=context.views, step=step)
         errors = context.on_rank0(lambda: probe.row_errors(views).cpu())
         score = errors.to(context.device) * mean_absolute(table)
-        wanted = (score > 0) & not_sky(table)
-        chosen = within_room(wanted, score, control.capacity.room(table, int(wanted.sum()), step))
+        eligible = (score > 0) & not_sky(table)
+        chosen = within_room(eligible, score, self.capacity.room(table, int(eligible.sum()), step))
         count = int(chosen.sum())
         split_along(table, chosen)
         if "born" in table.statistics:
@@ -101,19 +95,13 @@ class LongAxis:
             table.statistics["born"] = torch.cat([old, numbers, numbers])
         return {"split": count}
 
-    def undone(self, table: ParameterTable) -> ParameterTable | None:
-        """With the whole in the place of each two halves that the last event made; None: there are none."""
+    def before_last_event(self, table: ParameterTable) -> ParameterTable | None:
+        """Returns a table with the whole in the place of each two halves of the last event; None: there are none."""
         first, second = twins_of(table.statistics["born"])
         if len(first) == 0:
             return None
         rows = detached_rows(table)
         whole = wholes(*({name: value[half] for name, value in rows.items()} for half in (first, second)))
-        others = torch.ones(len(table), dtype=torch.bool, device=first.device).index_fill_(
-            0, torch.cat([first, second]), False
-        )
-        values = {name: torch.cat([value[others], whole[name]]) for name, value in rows.items()}
-        return to_look_at(table, values)
-
-    def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
-        """None."""
-        return None
+        others = torch.ones(len(table), dtype=torch.bool, device=first.device)
+        others[torch.cat([first, second])] = False
+        return frozen_table(table, {name: torch.cat([value[others], whole[name]]) for name, value in rows.items()})

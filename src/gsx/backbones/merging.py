@@ -1,4 +1,4 @@
-"""Two Gaussians made one: moments are kept, and by how much the field that they are changes with that.
+"""Merges two Gaussians into one that keeps their moments, and measures by how much their field changes.
 
 A Gaussian weighs as much as its opacity times its surface: what a viewer sees of it, not its volume (splat-transform,
 `--decimate-uniform`; NanoGS weighs volumes). The merged one has the means, covariances and colours of both by weight,
@@ -29,31 +29,31 @@ LARGEST_OPACITY = 1 - 1e-4
 
 
 def covariances(rows: Rows) -> Float[Tensor, "N 3 3"]:
-    """Of Gaussians by raw parameters, world units squared."""
+    """Returns covariances of Gaussians by raw parameters, world units squared."""
     spread = rotation_matrices(rows["quats"]) * rows["log_scales"].exp()[:, None]
     return spread @ spread.mT
 
 
 def principal_axes(covariance: Float[Tensor, "N 3 3"]) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
-    """(variances along the axes, ascending; unit quaternions of the axes)."""
+    """Returns (variances along the axes, ascending; unit quaternions of the axes)."""
     variances, axes = torch.linalg.eigh(covariance)
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]
     return variances, normalize(quaternions_of(axes), dim=1)
 
 
 def surfaces(scales: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-    """Of ellipsoids with these half axes (Thomsen's formula)."""
+    """Returns surfaces of ellipsoids with these half axes (Thomsen's formula)."""
     a, b, c = (scales.double() ** POWER).unbind(1)
     return 4 * math.pi * ((a * b + a * c + b * c) / 3) ** (1 / POWER)
 
 
 def weights_of(rows: Rows) -> Float[Tensor, "N"]:
-    """Opacities times surfaces."""
+    """Returns opacities times surfaces."""
     return rows["opacity_logits"].double().sigmoid() * surfaces(rows["log_scales"].double().exp())
 
 
 def merged(rows: Rows, first: Int[Tensor, "P"], second: Int[Tensor, "P"]) -> dict[str, Tensor]:
-    """One row for each pair of rows: parameters and other numbers by weight, whole numbers of the first."""
+    """Returns one row for each pair of rows: numbers in the weighted mean, whole numbers of the first."""
     weights = weights_of(rows)
     total = weights[first] + weights[second]
     share = weights[first] / total.clamp_min(torch.finfo(total.dtype).tiny)
@@ -85,12 +85,12 @@ class Densities:
     amplitudes: Float[Tensor, "N C"]
 
     def at(self, index: Int[Tensor, "P"]) -> "Densities":
-        """Some of them."""
+        """Returns some of them."""
         return Densities(**{name: value[index] for name, value in vars(self).items()})
 
 
 def densities(rows: Rows, colours: Float[Tensor, "N 3"]) -> Densities:
-    """Of Gaussians with these colours. That something is there counts as a colour of 1: the dark covers, too."""
+    """Returns densities of Gaussians with these colours, and one of 1: the dark covers, too."""
     opacities = rows["opacity_logits"].double().sigmoid()[:, None]
     seen = torch.cat([colours.double(), torch.ones_like(opacities)], 1)
     double = {name: rows[name].double() for name in PARAMETERS}
@@ -101,8 +101,10 @@ def densities(rows: Rows, colours: Float[Tensor, "N 3"]) -> Densities:
 
 
 def products(a: Densities, b: Densities) -> Float[Tensor, "P"]:
-    """Integrals of one density times the other over space, summed over colours: (2 pi)^1.5 |A|^.5 |B|^.5 |A + B|^-.5
-    exp(-d^T (A + B)^-1 d / 2), d the distance of the means."""
+    """Integrates one density times the other over space, summed over colours.
+
+    (2 pi)^1.5 |A|^.5 |B|^.5 |A + B|^-.5 exp(-d^T (A + B)^-1 d / 2), d the distance of the means.
+    """
     both, apart = a.covariances + b.covariances, (a.means - b.means)[:, :, None]
     exponent = (apart.mT @ torch.linalg.solve(both, apart))[:, 0, 0]
     volumes = (torch.linalg.det(a.covariances) * torch.linalg.det(b.covariances) / torch.linalg.det(both)).sqrt()
@@ -110,7 +112,7 @@ def products(a: Densities, b: Densities) -> Float[Tensor, "P"]:
 
 
 def changes(a: Densities, b: Densities, whole: Densities) -> Float[Tensor, "P"]:
-    """Integral of the squared difference of a + b and `whole`, as a share of that of (a + b)^2."""
+    """Returns the integral of the squared difference of a + b and `whole` over that of (a + b)^2."""
     before = products(a, a) + products(b, b) + 2 * products(a, b)
     difference = before + products(whole, whole) - 2 * products(a, whole) - 2 * products(b, whole)
     return difference.clamp_min(0) / before.clamp_min(torch.finfo(before.dtype).tiny)

@@ -6,7 +6,7 @@ The 3D filter widens each Gaussian by what the finest training camera can resolv
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Protocol, runtime_checkable
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -64,67 +64,28 @@ class MipOptions:
             raise ValueError(f"backbone.mip.rate is '{self.rate}'; choose {' or '.join(RATES)}")
 
 
-@runtime_checkable
-class Filter(Protocol):
-    """What is done to Gaussians so that they do not alias."""
-
-    @property
-    def note(self) -> str:
-        """A splat file's comment on the 3D filter; empty: there is none."""
-        ...
-
-    def rules(self, raster: RasterSettings) -> RasterSettings:
-        """The rasterizer's rules with the 2D filter."""
-        ...
-
-    def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
-        """Bring the column `filter`, if there is one, to where the primitives are after a step."""
-        ...
-
-    def due(self, step: int) -> bool:
-        """Whether to do so at a step without a density event."""
-        ...
-
-    def pseudo_views_made(self, views: Sequence[PseudoView]) -> None:
-        """Take notice of the pseudo views that were made for the step under way."""
-        ...
-
-    def narrows(self, step: int) -> bool:
-        """Whether sizes after a step are smaller for what is seen more finely: the picture is to go on as it was."""
-        ...
-
-    def smoothed(
-        self,
-        scales: Float[Tensor, "M 3"],
-        log_opacities: Float[Tensor, "M"],
-        table: ParameterTable,
-        rows: Int[Tensor, "M"] | None,
-    ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
-        """Scales and log-opacities after the 3D filter; `rows` of the table, None: all."""
-        ...
-
-
-class NoFilter:
-    """Gaussians as they are."""
+class Filter:
+    """What is done to Gaussians so that they do not alias; here nothing."""
 
     note = ""
+    """A splat file's comment on the 3D filter; empty: there is none."""
 
     def rules(self, raster: RasterSettings) -> RasterSettings:
-        """Those given."""
+        """Returns the rasterizer's rules with the 2D filter."""
         return raster
 
     def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
-        """There is no column."""
+        """Brings the column `filter`, if there is one, to where the primitives are after a step."""
 
     def due(self, step: int) -> bool:
-        """Never."""
+        """Returns whether to do so at a step without a density event."""
         return False
 
     def pseudo_views_made(self, views: Sequence[PseudoView]) -> None:
-        """They change nothing."""
+        """Receives the pseudo views that were made for the step under way."""
 
     def narrows(self, step: int) -> bool:
-        """Never."""
+        """Returns whether sizes after a step are smaller for finer views: the picture is to go on as it was."""
         return False
 
     def smoothed(
@@ -134,12 +95,12 @@ class NoFilter:
         table: ParameterTable,
         rows: Int[Tensor, "M"] | None,
     ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
-        """Those given."""
+        """Returns scales and log-opacities after the 3D filter; `rows` of the table, None: all."""
         return scales, log_opacities
 
 
 @dataclass(frozen=True, kw_only=True)
-class ZoomedRule(NoFilter):
+class ZoomedRule(Filter):
     """Gaussians as they are, dilated by what the finest training camera dilates them by, whatever camera draws them."""
 
     zoomed: str
@@ -148,7 +109,7 @@ class ZoomedRule(NoFilter):
     """Those of the training views."""
 
     def rules(self, raster: RasterSettings) -> RasterSettings:
-        """With the focal length that dilation belongs to."""
+        """Adds the focal length that dilation belongs to."""
         focal = max(camera.focal for camera in self.cameras)
         try:
             return replace(raster, zoomed=self.zoomed, training_focal=focal)
@@ -157,52 +118,48 @@ class ZoomedRule(NoFilter):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MipFilter:
+class MipFilter(Filter):
     """Both filters of Mip-Splatting; sizes of the 3D filter are a column of the table, world units."""
 
     options: MipOptions
     context: BackboneContext
     """With the cameras of the training views."""
     schedule: Schedule
-    settled: int
-    """Step at which density control ends: from there on the filter has a clock of its own."""
-    made: list[PseudoView] = field(default_factory=list)
-    """Pseudo views that were made for the step under way, if they count."""
+    density_ends: int
+    """Step from which the filter has a clock of its own."""
+    new_views: list[PseudoView] = field(default_factory=list)
+    """Pseudo views made for the step under way, if they narrow the filter."""
     note: str = "3D filter fused into scales and opacities"
 
     def rules(self, raster: RasterSettings) -> RasterSettings:
-        """Dilation by the kernel, with compensated opacities."""
+        """Returns dilation by the kernel, with compensated opacities."""
         kernel = self.options.kernel or MATCHED[self.context.scene.reduction.filter]
         return replace(raster, dilation=kernel, compensate=True)
 
     def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
-        """Sizes from where the primitives are after a step (Mip-Splatting, compute_3D_filter)."""
-        points, options, resolution = means.detach(), self.options, self.context.views
-        cameras = resolution.raster_cameras(step + 1)
+        """Computes sizes from where the primitives are after a step (Mip-Splatting, compute_3D_filter)."""
+        points, options, views = means.detach(), self.options, self.context.views
+        cameras = views.raster_cameras(step + 1)
         sizes = filter_sizes(points, cameras, options)
         if options.views > 1:
             sizes = sizes / several_views(points, cameras, sizes, options)
         if options.pseudo:
-            earn(table, points, self.made, sizes, options)
+            earn(table, points, self.new_views, sizes, options)
             sizes = sizes.minimum(table["earned"])
         table.columns["filter"] = sizes
 
     def due(self, step: int) -> bool:
-        """Every interval between the end of density control and the freezing of the filter (Mip-Splatting), and where
-        renders become finer."""
-        options, schedule = self.options, self.schedule
-        if self.narrows(step):
-            return True
-        inside = self.settled < step < schedule.step(options.stop)
-        return inside and step % schedule.interval(options.every) == 0
+        """Returns true at intervals after density control until the filter freezes (Mip-Splatting), or if narrowing."""
+        inside = self.density_ends < step < self.schedule.step(self.options.stop)
+        return self.narrows(step) or (inside and step % self.schedule.interval(self.options.every) == 0)
 
     def narrows(self, step: int) -> bool:
-        """Where renders become finer, and where pseudo views that count for it were made."""
-        return self.context.views.changes_after(step) or bool(self.made)
+        """Returns whether renders become finer, or pseudo views that narrow the filter were made."""
+        return self.context.views.changes_after(step) or bool(self.new_views)
 
     def pseudo_views_made(self, views: Sequence[PseudoView]) -> None:
-        """Keep those of this step, if they are to narrow the filter."""
-        self.made[:] = views if self.options.pseudo else []
+        """Keeps those of this step, if they narrow the filter."""
+        self.new_views[:] = views if self.options.pseudo else []
 
     def smoothed(
         self,
@@ -211,23 +168,28 @@ class MipFilter:
         table: ParameterTable,
         rows: Int[Tensor, "M"] | None,
     ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
-        """By the column `filter`."""
+        """Widens Gaussians by the column `filter`."""
         sizes = table["filter"]
         return smoothed(scales, log_opacities, sizes if rows is None else sizes[rows])
 
 
-def filter_named(name: str, options: MipOptions, context: BackboneContext, schedule: Schedule, settled: int) -> Filter:
-    """The filter of that name; see `MipFilter`. Supersampled training counts as cameras that are so much finer for the
-    3D filter, which bounds what can be learnt, and not for the dilation, which is a part of what is learnt."""
+def filter_named(
+    name: str, options: MipOptions, context: BackboneContext, schedule: Schedule, density_ends: int
+) -> Filter:
+    """Builds the filter of that name.
+
+    For the 3D filter, which bounds what can be learnt, supersampled training counts as finer cameras; not for the
+    dilation, which is a part of what is learnt.
+    """
     if name == "none":
-        return NoFilter()
+        return Filter()
     if name in ("magnified", "resampled"):
         return ZoomedRule(zoomed=name, cameras=[view.camera for view in context.scene.train])
-    return MipFilter(options=options, context=context, schedule=schedule, settled=settled)
+    return MipFilter(options=options, context=context, schedule=schedule, density_ends=density_ends)
 
 
 def checked_filter(name: str) -> None:
-    """Raise ValueError for a name that is no filter."""
+    """Raises ValueError for a name that is no filter."""
     if name not in FILTERS:
         raise ValueError(f"backbone.filter is '{name}'; choose one of {', '.join(FILTERS)}")
 
@@ -235,7 +197,7 @@ def checked_filter(name: str) -> None:
 def seen_depths(
     points: Float[Tensor, "N 3"], camera: Camera, options: MipOptions
 ) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
-    """(depth z, whether the camera counts as seeing the point) (Mip-Splatting, compute_3D_filter)."""
+    """Returns (depth z, whether the camera counts as seeing the point) (Mip-Splatting, compute_3D_filter)."""
     local = camera.to_camera(points).to(points)
     depth = local[:, 2].clamp_min(LEAST_DEPTH)
     column = local[:, 0] / depth * camera.fx + camera.cx
@@ -247,10 +209,10 @@ def seen_depths(
 
 @torch.no_grad()
 def filter_sizes(points: Float[Tensor, "N 3"], cameras: Sequence[Camera], options: MipOptions) -> Float[Tensor, "N"]:
-    """Standard deviation of the 3D filter at each point, world units: sqrt(variance) times the depth over the focal
-    length of the finest camera that sees it (`MipOptions.rate`).
+    """Returns the standard deviation of the 3D filter at each point, world units (Mip-Splatting, compute_3D_filter).
 
-    Points that no camera sees get the largest size of those that are seen (Mip-Splatting, compute_3D_filter).
+    It is sqrt(variance) times the depth over the focal length of the finest camera that sees the point
+    (`MipOptions.rate`). Points that no camera sees get the largest size of the others.
 
     Raises:
         InputError: no camera sees any point.
@@ -275,8 +237,10 @@ def filter_sizes(points: Float[Tensor, "N 3"], cameras: Sequence[Camera], option
 
 @torch.no_grad()
 def absorb(table: ParameterTable, before: Float[Tensor, "N"], after: Float[Tensor, "N"]) -> None:
-    """Change stored scales and opacities so that what is drawn stays as it is when the 3D filter goes from sizes
-    `before` to smaller ones `after`: s'^2 = s^2 + before^2 - after^2, o' = o prod_k s_k / s'_k."""
+    """Changes stored scales and opacities so that pictures stay when the 3D filter narrows from `before` to `after`.
+
+    s'^2 = s^2 + before^2 - after^2, o' = o prod_k s_k / s'_k.
+    """
     scales = table["log_scales"].exp()
     wider = (scales.square() + (before.square() - after.square()).clamp_min(0)[:, None]).sqrt()
     log_opacities = logsigmoid(table["opacity_logits"]) + (scales / wider).clamp_min(LEAST_SHARE).log().sum(1)
@@ -288,8 +252,10 @@ def absorb(table: ParameterTable, before: Float[Tensor, "N"], after: Float[Tenso
 def several_views(
     points: Float[Tensor, "N 3"], cameras: Sequence[Camera], sizes: Float[Tensor, "N"], options: MipOptions
 ) -> Float[Tensor, "N"]:
-    """How many times as finely views sample each point together as the finest of them alone, from 1 to the most: a
-    third of the square root of their number, each counted by its density over the finest one's, squared."""
+    """Returns how many times as finely all views sample each point as the finest one alone, from 1 to `options.views`.
+
+    It is a third of the square root of their number, each counted by its density over the finest one's, squared.
+    """
     views, deviation = torch.zeros_like(sizes), options.variance**0.5
     for camera in cameras:
         depth, seen = seen_depths(points, camera, options)
@@ -304,7 +270,7 @@ def earn(
     sizes: Float[Tensor, "N"],
     options: MipOptions,
 ) -> None:
-    """Bring the column `earned` to the smallest size that pseudo views have allowed so far; infinite where none has."""
+    """Lowers the column `earned` to the smallest size that pseudo views have allowed; infinite where none has."""
     earned = table.columns.get("earned", torch.full_like(sizes, torch.inf))
     for view in views:
         earned = earned.minimum(earned_size(points, view, sizes, options))
@@ -315,8 +281,11 @@ def earn(
 def earned_size(
     points: Float[Tensor, "N 3"], view: PseudoView, sizes: Float[Tensor, "N"], options: MipOptions
 ) -> Float[Tensor, "N"]:
-    """Filter of what a pseudo view sees: as its own density allows where its pixels count whole, `sizes` where they do
-    not count, between them by their logarithms; infinite where it sees nothing."""
+    """Returns the filter of what a pseudo view sees; infinite where it sees nothing.
+
+    It is what the view's density allows where its pixels count whole, `sizes` where they do not count, and between them
+    by logarithms.
+    """
     camera = view.camera
     places, depth = camera.project(points)
     inside = (places >= 0) & (places < places.new_tensor(camera.size))

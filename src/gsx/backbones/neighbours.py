@@ -22,7 +22,7 @@ STRIDES = (1 << 42, 1 << 21, 1)
 
 
 def mean_square_distance(points: Float[Tensor, "P 3"], neighbours: int = 3) -> Float[Tensor, "P"]:
-    """Mean of the squared distances to the nearest other points, exact search (3D-GS, simple-knn).
+    """Returns the mean squared distance to the nearest other points, exact search (3D-GS, simple-knn).
 
     With fewer than `neighbours` other points it is the mean over those there are; a single point gives 0, none nothing.
     """
@@ -31,7 +31,7 @@ def mean_square_distance(points: Float[Tensor, "P 3"], neighbours: int = 3) -> F
 
 
 def nearest(points: Float[Tensor, "P 3"], count: int) -> tuple[Float[Tensor, "P count"], Int[Tensor, "P count"]]:
-    """(squared distances to the nearest other points, ascending; which these are); `count` is 1..P - 1."""
+    """Returns (squared distances to the nearest other points, ascending; their indices); `count` is 1..P - 1."""
     squares = points.new_empty(len(points), count)
     which = torch.empty(len(points), count, dtype=torch.long, device=points.device)
     pending = torch.arange(len(points), device=points.device)
@@ -49,18 +49,18 @@ def nearest(points: Float[Tensor, "P 3"], count: int) -> tuple[Float[Tensor, "P 
     return squares, which
 
 
-Found = tuple[Float[Tensor, "R count"], Int[Tensor, "R count"]]
-"""Squared distances of rows to their nearest other points, ascending; which these are."""
+Nearest = tuple[Float[Tensor, "R count"], Int[Tensor, "R count"]]
+"""Squared distances of rows to their nearest other points, ascending, and the indices of these."""
 
 
 def joined(parts: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    """Of all rows, from parts of them."""
+    """Joins the results of parts of the rows."""
     squares, which = zip(*parts, strict=True)
     return torch.cat(squares), torch.cat(which)
 
 
-def directly(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], count: int) -> Found:
-    """By comparison with all points."""
+def directly(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], count: int) -> Nearest:
+    """Compares rows with all points."""
     parts = []
     for part in rows.split(max(1, CHUNK_VALUES // len(points))):
         distance = torch.cdist(points[part], points, compute_mode="donot_use_mm_for_euclid_dist")
@@ -70,8 +70,8 @@ def directly(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], count: int) -
     return joined(parts)
 
 
-def in_cells(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], cell: float, count: int) -> Found:
-    """Among points in the 27 cells around each row; inf where there are too few."""
+def in_cells(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], cell: float, count: int) -> Nearest:
+    """Searches points in the 27 cells around each row; inf where there are too few."""
     owner, candidate = candidates(points, rows, cell)
     square = (points[rows[owner]] - points[candidate]).square().sum(1)
     by_distance = square.argsort(stable=True)
@@ -89,7 +89,7 @@ def in_cells(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], cell: float, 
 def candidates(
     points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], cell: float
 ) -> tuple[Int[Tensor, "C"], Int[Tensor, "C"]]:
-    """(number within `rows`, other point) for all points in the 27 cells around each row."""
+    """Returns (number within `rows`, other point) for all points in the 27 cells around each row."""
     strides = torch.tensor(STRIDES, device=points.device)
     numbers = ((points.double() / cell).floor().long() * strides).sum(1)
     sorted_numbers, order = numbers.sort(stable=True)

@@ -18,7 +18,7 @@ QUIRKS = ("gate", "bias")
 
 @dataclass(frozen=True, kw_only=True)
 class CloneSplitOptions:
-    """What the second form has of its own; everything else it shares with the first."""
+    """Options of the second form; all others it shares with the first."""
 
     rates: Rates
     density: Density
@@ -48,13 +48,13 @@ class OctreeGS3DOptions(ExplicitOptions):
 
 
 def free_options(options: OctreeGS3DOptions) -> tuple[GS3DOptions, LevelOptions, LevelDensityOptions]:
-    """What the second form takes: options of its Gaussians, of its levels, of density control across them.
+    """Returns the second form's options of Gaussians, of levels, and of density control across them.
 
     Raises:
         ValueError: something that it needs is missing, or a switch is set that it does not have.
     """
-    own = options.clone_split
-    if own is None or options.levels is None:
+    second = options.clone_split
+    if second is None or options.levels is None:
         missing = "levels" if options.levels is None else "clone_split"
         raise ValueError(f"backbone.{missing} is null, and densification is clone_split; without levels: backbone=gs3d")
     idle = [name for name, value in vars(options.quirks).items() if value and name not in QUIRKS]
@@ -63,26 +63,26 @@ def free_options(options: OctreeGS3DOptions) -> tuple[GS3DOptions, LevelOptions,
             f"backbone.quirks.{idle[0]} is '{getattr(options.quirks, idle[0])}', which means nothing to "
             f"densification=clone_split: leave it '', only {' and '.join(QUIRKS)} do"
         )
-    both = vars(options) | {"rates": own.rates, "density": own.density}
+    both = vars(options) | {"rates": second.rates, "density": second.density}
     gaussians = GS3DOptions(**{field.name: both[field.name] for field in fields(GS3DOptions) if field.name in both})
     levels = faithful(options.levels, options.fidelity)
     assert levels is not None
-    return gaussians, levels, own.level_density
+    return gaussians, levels, second.level_density
 
 
 def free_gaussians(options: OctreeGS3DOptions, context: BackboneContext) -> GS3D:
-    """The second form: Gaussians at several levels of detail."""
+    """Builds the second form: Gaussians at several levels of detail."""
     gaussians, level_options, density = free_options(options)
     schedule = context.schedule(options.published_iterations)
     cameras = [view.camera for view in context.scene.train]
     points = context.points().positions.float()
     levels = derive(points, cameras, level_options, all_levels_from(level_options, schedule))
-    visibility = VisibleByLevel(levels)
-    return GS3D(gaussians, context, visibility, CloneSplitAcrossLevels(visibility, density, options.switches()))
+    control = CloneSplitAcrossLevels(gaussians, context, levels, density, options.switches())
+    return GS3D(gaussians, context, VisibleByLevel(levels), control)
 
 
 def octree_gs3d(options: OctreeGS3DOptions, context: BackboneContext) -> Anchors | GS3D:
-    """The backbone octree_gs3d in the form that is asked for."""
+    """Builds the backbone octree_gs3d in the form that the options name."""
     if options.densification == "clone_split":
         return free_gaussians(options, context)
     return explicit_anchors(options, context)

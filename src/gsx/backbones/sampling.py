@@ -10,14 +10,14 @@ from gsx.core.shapes import Float
 
 
 def sampled_means(rows: dict[str, Tensor], generator: torch.Generator) -> Float[Tensor, "M 3"]:
-    """One place from each Gaussian, given by raw `means`, `quats` and `log_scales`."""
+    """Draws one place from each Gaussian, given by raw `means`, `quats` and `log_scales`."""
     noise = torch.randn(rows["means"].shape, generator=generator).to(rows["means"])
     offset = rotation_matrices(rows["quats"]) @ (noise * rows["log_scales"].exp())[:, :, None]
     return rows["means"] + offset[:, :, 0]
 
 
 def quantile(values: Float[Tensor, "M"], fraction: float) -> float:
-    """Linearly interpolated quantile of any number of values (torch.quantile refuses more than 2^24)."""
+    """Returns a linearly interpolated quantile of any number of values (torch.quantile refuses more than 2^24)."""
     place = fraction * (len(values) - 1)
     low, high = (float(values.kthvalue(rank + 1).values) for rank in (math.floor(place), math.ceil(place)))
     return low + (high - low) * (place - math.floor(place))

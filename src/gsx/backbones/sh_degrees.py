@@ -21,8 +21,8 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Judged:
-    """What is to become of the colours of N rows."""
+class ChosenDegrees:
+    """SH degrees of N rows, with their colours."""
 
     degrees: Int[Tensor, "N"]
     coefficients: Float[Tensor, "n 3 N"]
@@ -30,13 +30,13 @@ class Judged:
     highest: int
     """Degree that has been learnt."""
 
-    def to(self, device: torch.device | str) -> "Judged":
-        """On a device."""
+    def to(self, device: torch.device | str) -> "ChosenDegrees":
+        """Moves it to a device."""
         return replace(self, degrees=self.degrees.to(device), coefficients=self.coefficients.to(device))
 
 
 def numbers_of(degree: int, other: int) -> Int[Tensor, "D"]:
-    """How many numbers a Gaussian is with colours of each degree 0..`degree`; `other`: with none of them."""
+    """Returns how many numbers a Gaussian has with colours of each degree up to `degree`; `other`: without colours."""
     return other + 3 * torch.arange(1, degree + 2).square()
 
 
@@ -47,10 +47,10 @@ def least_degrees(
     price: float,
     numbers: Int[Tensor, "D"],
 ) -> Int[Tensor, "N"]:
-    """The degree of each Gaussian that costs least; the highest where no view shows it.
+    """Returns the degree of each Gaussian that costs least; the highest where no view shows it.
 
-    squares: of what a picture changes by with colours of a degree, in the mean over the views that show it.
-    error_share: the squared error of a view over what it shows; price: dB that a doubling of all numbers has to bring.
+    squares: squared change of a picture with colours of each degree, in the mean over the views that show the row.
+    error_share: squared error of a view over what it shows; price: dB that a doubling of all numbers has to bring.
     """
     share = (numbers / numbers[-1]).to(squares)
     cost = squares + error_exponent(price) * error_share * share[:, None]
@@ -58,13 +58,13 @@ def least_degrees(
 
 
 def kept_bands(degrees: Int[Tensor, "N"], count: int) -> Bool[Tensor, "N B"]:
-    """Whether each of the `count` coefficients behind the constant one is of a band within the degree of a row."""
+    """Marks coefficients behind the constant one, of `count`, whose band is within the degree of a row."""
     band = torch.arange(1, count + 1, device=degrees.device).sqrt().floor()
     return band <= degrees[:, None]
 
 
-def judged(fits: ColourFits, price: float, numbers: Int[Tensor, "D"]) -> Judged:
-    """The degree of each row that costs least, and its colours of that degree."""
+def choose_degrees(fits: ColourFits, price: float, numbers: Int[Tensor, "D"]) -> ChosenDegrees:
+    """Chooses the degree of each row that costs least, with its colours of that degree."""
     highest = len(numbers) - 1
     lower = [fitted(fits, degree) for degree in range(highest)]
     squares = torch.stack([squared_change(fits, one) for one in lower] + [torch.zeros_like(fits.norms)])
@@ -73,30 +73,30 @@ def judged(fits: ColourFits, price: float, numbers: Int[Tensor, "D"]) -> Judged:
     coefficients = torch.zeros_like(fits.current)
     for degree, one in enumerate(lower):
         coefficients[: len(one)] += one * (degrees == degree)
-    return Judged(degrees=degrees, coefficients=coefficients, highest=highest)
+    return ChosenDegrees(degrees=degrees, coefficients=coefficients, highest=highest)
 
 
-def lower_degrees(table: ParameterTable, found: Judged, step: int, price: float) -> dict[str, float]:
-    """Give rows the degrees and colours that were found; the bands above are zeroed with their moments."""
-    own, least = table["sh_degree"], found.degrees.to(table["sh_degree"])
-    lowered = least < found.highest
-    table.columns["sh_degree"] = torch.where(lowered, least, own)  # higher bands may not have begun to learn
-    take_coefficients(table, lowered, found.coefficients)
+def lower_degrees(table: ParameterTable, chosen: ChosenDegrees, step: int, price: float) -> dict[str, float]:
+    """Gives rows the chosen degrees and colours; it zeroes the bands above, with their moments."""
+    before, degrees = table["sh_degree"], chosen.degrees.to(table["sh_degree"])
+    lowered = degrees < chosen.highest
+    table.columns["sh_degree"] = torch.where(lowered, degrees, before)  # higher bands may not have begun to learn
+    take_coefficients(table, lowered, chosen.coefficients)
     clear_bands(table)
-    counts = torch.bincount(table["sh_degree"].long(), minlength=found.highest + 1).tolist()
-    told = ", ".join(f"{count} of degree {degree}" for degree, count in enumerate(counts))
-    logger.info("step %d: colours are judged at %.2f dB per doubling of numbers: %s", step, price, told)
+    counts = torch.bincount(table["sh_degree"].long(), minlength=chosen.highest + 1).tolist()
+    listed = ", ".join(f"{count} of degree {degree}" for degree, count in enumerate(counts))
+    logger.info("step %d: SH degrees at a price of %.2f dB per doubling of numbers: %s", step, price, listed)
     return {f"degree_{degree}": count for degree, count in enumerate(counts)}
 
 
 def clear_bands(table: ParameterTable) -> None:
-    """Zero the bands that rows do not have, and their moments."""
+    """Zeroes the bands that rows do not have, and their moments."""
     kept = kept_bands(table["sh_degree"], table["sh_rest"].shape[1])[..., None]
     edit(table, "sh_rest", lambda old: old * kept, lambda moment: moment * kept)
 
 
 def hold_bands(table: ParameterTable) -> None:
-    """Let no gradient move bands that rows do not have."""
+    """Zeroes gradients of bands that rows do not have."""
     rest = table["sh_rest"]
     if rest.grad is not None:
         rest.grad *= kept_bands(table["sh_degree"], rest.shape[1])[..., None]

@@ -63,9 +63,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         unicode = sys.stdout.encoding.lower().startswith("utf")  # then only bytes of file names are no letters of it
         sys.stdout.reconfigure(errors="surrogateescape" if unicode else "backslashreplace")
     if processes() > 1:
-        from gsx.core.training.distributed import as_one
+        from gsx.core.training.distributed import run_together
 
-        return as_one(lambda: dispatch_together(arguments), explained)
+        return run_together(lambda: dispatch_together(arguments), explained)
     try:
         code = dispatch(arguments)
         sys.stdout.flush()  # what nobody takes is noticed here, not when Python ends

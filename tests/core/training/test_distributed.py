@@ -23,7 +23,7 @@ from gsx.cli.dispatch import main
 from gsx.core.errors import ConfigError, Disagreement
 from gsx.core.plugins import load_plugins
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.training.distributed import Ranks, ranks_here
+from gsx.core.training.distributed import Ranks, current_ranks
 from gsx.core.training.guard import Agreement
 from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.run import Run, TrainingOptions
@@ -238,7 +238,7 @@ def test_a_stop_asked_of_one_process_stops_both_after_the_same_step(tmp_path: Pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "sentence"), [
-    ("killed", "gsx: another process of this run has died without a word"),
+    ("killed", "gsx: another process of this run exited unexpectedly"),
     ("drift", "gsx: ranks disagree at step 8"),
 ])  # fmt: skip
 def test_a_process_that_dies_or_drifts_is_noticed(kind: str, sentence: str, tmp_path: Path) -> None:
@@ -272,7 +272,7 @@ def test_other_verbs_are_for_one_process(tmp_path: Path) -> None:
 
 
 def test_a_process_by_itself_exchanges_nothing() -> None:
-    ranks = ranks_here()
+    ranks = current_ranks()
     part = {"rows": torch.arange(3)}
     assert (ranks.rank, ranks.size, ranks.first) == (0, 1, True)
     assert ranks.all_gather("word") == ["word"]

@@ -16,7 +16,7 @@ from gsx.core.training.parameter_table import (
     ParameterTable,
     append_rows,
     gradients,
-    group_named,
+    group_of,
     keep_rows,
     named_parameters,
     reset_column,
@@ -378,7 +378,7 @@ def test_steps_are_shorter_by_the_pace_and_rates_stay() -> None:
             sum(value.sum() for _, value in named_parameters(table)).backward()
             take_adam_step(table)
         moved[pace] = {name: before[name] - value.detach() for name, value in named_parameters(table)}
-        assert table.group("flat")["lr"] == group_named(table.networks.optimiser, "opacity")["lr"] == 0.5
+        assert table.group("flat")["lr"] == group_of(table.networks.optimiser, "opacity")["lr"] == 0.5
     for name, value in moved[1.0].items():
         torch.testing.assert_close(moved[0.25][name], 0.25 * value)
     torch.testing.assert_close(moved[1.0]["flat"], torch.ones(2))

@@ -96,7 +96,7 @@ def steps_when(due: object, iterations: int) -> list[int]:
 
 def test_published_cadence_at_full_length() -> None:
     backbone = small_gs3d(small_scene(spread(4), views=200), iterations=30000)
-    events = steps_when(backbone.control.due, 30000)
+    events = steps_when(backbone.control.events.due, 30000)
     assert (events[0], events[-1], len(events)) == (600, 14900, 144)
     assert events == list(range(600, 15000, 100))
     assert steps_when(backbone.control.reset_due, 30000) == [3000, 6000, 9000, 12000]
@@ -123,7 +123,7 @@ def test_opacities_are_not_reset_where_density_control_has_ended() -> None:
 )
 def test_cadence_of_a_tenth_of_the_run(views: int, events: range, resets: list[int]) -> None:
     backbone = small_gs3d(small_scene(spread(4), views=views), iterations=3000)
-    assert steps_when(backbone.control.due, 3000) == list(events)
+    assert steps_when(backbone.control.events.due, 3000) == list(events)
     assert steps_when(backbone.control.reset_due, 3000) == resets
 
 

@@ -11,7 +11,7 @@ from tiny import final_tensors, tiny_run, tiny_settings
 from torch import Tensor
 
 from gsx.backbones.adaptive import Adaptive, AdaptiveOptions
-from gsx.backbones.capacity import Growing
+from gsx.backbones.capacity import EventSteps
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.coarser import coarser
@@ -85,7 +85,7 @@ def test_windows_that_are_judged_by_lie_at_the_same_place_of_coarser_views() -> 
     found = []
     for coarse in (1, 2):
         context = small_context(scene, modules=coarse_modules(scene, coarse, 50 if coarse > 1 else 0))
-        judge = Adaptive(AdaptiveOptions(views=3), context, Growing(0, 100, 10), 0)
+        judge = Adaptive(AdaptiveOptions(views=3), context, EventSteps(0, 100, 10), 0)
         found.append({view.name: window for view, window in judge.windows(20).items()})
     assert found[0].keys() == found[1].keys()
     for name, window in found[0].items():

@@ -1,4 +1,4 @@
-"""What the trainer asks of a backbone, and what a backbone is given to start from."""
+"""The interface of a backbone, and the context that it is built from."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,37 +23,41 @@ from gsx.core.training.training_views import TrainingViews
 T = TypeVar("T")
 MOST_LOST, FEW = 0.01, 10
 """Share of the primitives that a step may lose because they cannot be drawn, and how many of few."""
+CAUTION = "caution"
+"""Key of a plan's part whose text is logged as a warning."""
 Observation: TypeAlias = dict[str, Tensor]
 """What density control learns from one render, as tensors by name, none of them 0-dimensional; empty: nothing."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BackboneContext:
-    """What a backbone is built from."""
+    """Scene, schedule, rules and randomness that a backbone is built from."""
 
     scene: Scene
     iterations: int
     device: torch.device
     raster: RasterSettings
-    """The rules pictures are drawn by, unless the backbone asks for others (`Backbone.raster`)."""
+    """Rules of the rasterizer, unless the backbone has others (`Backbone.raster`)."""
     generator: torch.Generator
     """The run's only source of randomness (a CPU generator)."""
     views: TrainingViews
-    """How training views are seen and rendered at each step, and compared with renders."""
+    """Training views at each step, how they are rendered, and compared with renders."""
     ranks: Ranks = Ranks()
     """The processes that train it together."""
     begins: bool = True
-    """Whether the model starts from the scene; otherwise a checkpoint is to take the place of its table."""
+    """Whether the model starts from the scene; otherwise a checkpoint replaces its table."""
 
-    def on_rank0(self, look: Callable[[], T]) -> T:
-        """What the first process finds, on all of them, so that all decide alike: renders of others may differ in a
-        last bit. The generator goes on from there on all. Tensors are to be on the CPU."""
-        found, state = self.ranks.broadcast(lambda: (look(), self.generator.get_state()))
+    def on_rank0(self, measure: Callable[[], T]) -> T:
+        """Runs a measurement on rank 0 and broadcasts the result and the generator's state; tensors are on the CPU.
+
+        All ranks then decide alike, though their renders may differ in a last bit.
+        """
+        result, state = self.ranks.broadcast(lambda: (measure(), self.generator.get_state()))
         self.generator.set_state(state)
-        return found
+        return result
 
     def points(self) -> PointCloud:
-        """What the model starts from.
+        """Returns the points that the model starts from.
 
         Raises:
             InputError: the scene has no points.
@@ -73,7 +77,7 @@ class BackboneContext:
 
 @runtime_checkable
 class Drawn(Protocol):
-    """What a backbone draws for one camera; each backbone adds what it needs to learn from the render."""
+    """The splats of one camera; each backbone adds what it needs to learn from the render."""
 
     @property
     def splats(self) -> Splats:
@@ -107,42 +111,41 @@ class Backbone(Protocol[D]):
     """
 
     table: ParameterTable
-    """Everything that it learns, and all that it needs to go on exactly."""
+    """Everything that it learns, and all that it needs to resume exactly."""
     raster: RasterSettings
-    """The rules its splats are drawn by: those of the context, with filters of its own."""
+    """Rules of the rasterizer for its splats: those of the context, with its filters."""
     absolute_gradient: bool
-    """Whether `observe` wants absolute gradients in training renders."""
+    """Whether `observe` needs absolute gradients of training renders."""
 
     def draw(self, camera: Camera, step: int) -> D:
-        """The splats of this camera, as the model stands at this step."""
+        """Returns the splats of a camera at a step."""
         ...
 
     def regulariser(self, drawn: D) -> Float[Tensor, ""] | None:
-        """A term to add to the loss of a view, or None."""
+        """Returns a term to add to the loss of a view, or None."""
         ...
 
     def observe(self, drawn: D, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
-        """What density control learns from a render of what was drawn, after its backward pass.
+        """Returns what density control learns from a render of what was drawn, after its backward pass.
 
-        `weight`: of the render in the step's loss, whose gradients its screen means have. It counts as so much of a
-        photograph (`backbones.density`).
+        `weight`: of the render in the step's loss, whose gradients its screen means have (`backbones.density`).
         """
         ...
 
-    def accumulate(self, seen: Observation) -> None:
-        """Count an observation in by its weight: one of this process, or of another that trains the same model."""
+    def accumulate(self, observation: Observation) -> None:
+        """Adds an observation of this process, or of another that trains the same model, to the statistics."""
         ...
 
     def densify_and_prune(self, step: int) -> Mapping[str, float]:
-        """Change the number of rows; returns what was done, for the log, empty when nothing."""
+        """Changes the number of rows; returns metrics for the log, empty when nothing was done."""
         ...
 
     def update(self, step: int) -> None:
-        """Let the optimiser move the parameters, by the learning rates of this step, and clear their gradients."""
+        """Moves the parameters by the learning rates of this step, and clears their gradients."""
         ...
 
     def explicit(self, camera: Camera | None, step: int) -> Gaussians:
-        """Explicit Gaussians of a standard splat file: those a camera draws, or (None) those that hold for all.
+        """Returns Gaussians of a standard splat file: those a camera draws, or (None) those that hold for all.
 
         Raises:
             GsxError: no camera is given, and there is no camera-independent form.
@@ -150,35 +153,30 @@ class Backbone(Protocol[D]):
         ...
 
 
-CAUTION = "caution"
-"""Key of a plan's part whose text is told as a warning."""
-
-
 @runtime_checkable
 class Planned(Protocol):
-    """A backbone with a schedule to tell."""
+    """A backbone with a schedule to log."""
 
     def plan(self) -> dict[str, Any]:
-        """The rescaled schedule in absolute steps, for the log and the report: numbers or lists of them by name, or
-        several such parts by theirs; see CAUTION."""
+        """Returns the rescaled schedule in absolute steps: numbers or lists by name, in parts by name; see CAUTION."""
         ...
 
 
 @runtime_checkable
 class Settling(Protocol):
-    """A backbone that does things once, which a run that leaves out steps is not to pass by."""
+    """A backbone that does things once, at steps that a run must not leave out."""
 
     def settles(self) -> Sequence[int]:
-        """Steps at which something is done once, or after which something is done no more."""
+        """Returns steps at which something is done once, or after which something is done no more."""
         ...
 
 
 @runtime_checkable
 class Validating(Protocol):
-    """A backbone that keeps parts of training views from being learnt for a while, to judge by them."""
+    """A backbone that keeps windows of training views out of the loss for a while, to measure by them."""
 
     def validation_window(self, view: View, step: int) -> Window | None:
-        """The window of the view that is to count in no loss at this step; None: all of it counts."""
+        """Returns the window of the view that counts in no loss at this step; None: all of it counts."""
         ...
 
 
@@ -220,11 +218,11 @@ class WithOwnFile(Protocol):
     """A backbone whose published code writes splat files with more in them than standard ones."""
 
     def file_columns(self) -> dict[str, Float[Tensor, "N"]] | None:
-        """Columns of that file, in order; None: as it is composed, a standard file says everything."""
+        """Returns columns of that file, in order; None: as it is composed, a standard file says everything."""
         ...
 
     def file_notes(self) -> list[str]:
-        """Comments of any file of it: what a viewer must know beside the screen dilation."""
+        """Returns comments of any file of it: what a viewer must know beside the screen dilation."""
         ...
 
 
@@ -233,23 +231,23 @@ class Bakeable(Protocol):
     """A backbone whose splats depend on the camera, and can be followed from one camera to the next."""
 
     def slot_count(self) -> int:
-        """How many numbers there are."""
+        """Returns how many numbers there are."""
         ...
 
     def slots(self, drawn: Any) -> tuple[Int[Tensor, "M"], Int[Tensor, "V"]]:
-        """(a number for each splat drawn, the same from every camera; the numbers of all that could have been).
+        """Returns (a number for each splat drawn, the same from every camera; numbers of all that could be drawn).
 
-        What could have been and is not drawn has opacity 0 for this camera.
+        Those that could be drawn and are not have opacity 0 for this camera.
         """
         ...
 
 
 @runtime_checkable
 class FromGaussians(Protocol):
-    """A backbone that can go on from a standard splat file (`init=FILE`)."""
+    """A backbone that can start from a standard splat file (`init=FILE`)."""
 
     def go_on_from(self, gaussians: Gaussians) -> None:
-        """Take these in the place of what it was built with; no band of their colours waits for a later step.
+        """Replaces what it was built with by these; no band of their colours waits for a later step.
 
         Raises:
             InputError: it cannot, as it is composed.
@@ -259,10 +257,9 @@ class FromGaussians(Protocol):
 
 @torch.no_grad()
 def remove_nonfinite(backbone: Backbone[Any], cameras: Sequence[Camera], step: int) -> int:
-    """Remove rows with values that are not finite, or that one of the cameras cannot draw; returns how many.
+    """Removes rows with values that are not finite, or that one of the cameras cannot draw; returns how many.
 
-    Called when a render left some out, or when gradients are not finite. Where nothing is removed nothing changes,
-    gradients included.
+    Where nothing is removed nothing changes, gradients included.
 
     Raises:
         LostModel: so much would be lost that what is left is another model. Nothing is removed.
@@ -285,9 +282,9 @@ def remove_nonfinite(backbone: Backbone[Any], cameras: Sequence[Camera], step: i
 
 
 def drawable_rows(backbone: Backbone[Any], camera: Camera, step: int) -> Bool[Tensor, "N"]:
-    """Rows that the camera draws or has no business with: False for splats or volumes that are out of range.
+    """Marks rows that the camera draws or does not see: False for splats or volumes that are out of range.
 
-    Where none of those in view can be drawn networks are to blame, if there are any, and no row.
+    Where none of those in view can be drawn, networks are to blame, if there are any, and no row.
     """
     drawn, table = backbone.draw(camera, step), backbone.table
     splats = drawn.splats
@@ -295,5 +292,6 @@ def drawable_rows(backbone: Backbone[Any], camera: Camera, step: int) -> Bool[Te
     if drawn.rows is None:
         return good
     all_rows = torch.ones(len(table), dtype=torch.bool, device=good.device)
-    found = all_rows.index_fill(0, drawn.rows[~good], False)
-    return all_rows if table.networks is not None and not bool(found[drawn.rows].any()) else found
+    drawable_ones = all_rows.index_fill(0, drawn.rows[~good], False)
+    networks_fail = table.networks is not None and not bool(drawable_ones[drawn.rows].any())
+    return all_rows if networks_fail else drawable_ones

@@ -20,10 +20,18 @@ from gsx.core.shapes import Bool
 
 ADAM_EPSILON = 1e-15
 """Gradients of a mean loss are tiny (3D-GS, training_setup)."""
+RECORD = "record."
+"""Prefix of entries of a record in checkpoints."""
 
 
-def group_named(optimiser: torch.optim.Adam, name: str) -> dict:
-    """The group of one parameter or network."""
+def adam(groups: Mapping[str, list[Parameter]]) -> torch.optim.Adam:
+    """Builds Adam with a named group for each list of parameters, at rate 0."""
+    named = [{"params": parameters, "name": name, "lr": 0.0} for name, parameters in groups.items()]
+    return torch.optim.Adam(named, eps=ADAM_EPSILON, fused=True)
+
+
+def group_of(optimiser: torch.optim.Adam, name: str) -> dict:
+    """Returns the group of one parameter or network."""
     return next(group for group in optimiser.param_groups if group["name"] == name)
 
 
@@ -34,7 +42,7 @@ class Networks:
     modules: nn.Module
     """A network for each child; a learning rate is set by its name."""
     colour: nn.Module
-    """Of them the one that makes colours, which pseudo views may leave alone."""
+    """The network of them that makes colours, which pseudo views may leave alone."""
     optimiser: torch.optim.Adam = field(init=False)
 
     def __post_init__(self) -> None:
@@ -44,23 +52,22 @@ class Networks:
                 f"{' and '.join(outside)} of a backbone's networks would never learn: each child of `modules` has a "
                 "learning rate, so put parameters into one, for example nn.ModuleDict({'colour': network})"
             )
-        groups = [{"params": list(part.parameters()), "name": name, "lr": 0.0} for name, part in parts.items()]
-        self.optimiser = torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)
+        self.optimiser = adam({name: list(part.parameters()) for name, part in parts.items()})
 
     def names(self) -> list[str]:
-        """Names of the networks."""
+        """Returns the names of the networks."""
         return [group["name"] for group in self.optimiser.param_groups]
 
     def set_rate(self, name: str, rate: float) -> None:
-        """Learning rate of one network."""
-        group_named(self.optimiser, name)["lr"] = rate
+        """Sets the learning rate of one network."""
+        group_of(self.optimiser, name)["lr"] = rate
 
     def named(self) -> Iterator[tuple[str, Parameter]]:
-        """Parameters by the names that they are saved under."""
+        """Yields parameters by their names in checkpoints."""
         return ((f"heads.{name}", parameter) for name, parameter in self.modules.named_parameters())
 
     def buffers(self) -> Iterator[tuple[str, Tensor]]:
-        """What networks keep beside parameters (means of a batch norm ...), by the names that it is saved under."""
+        """Yields what networks keep beside parameters (means of a batch norm ...), by its names in checkpoints."""
         state = self.modules.state_dict(keep_vars=True).items()
         return (
             (f"buffers.{name}", value)
@@ -80,14 +87,15 @@ class ParameterTable:
     """Values with N rows that density control gathers; new rows begin with 0."""
     networks: Networks | None = None
     record: dict[str, Tensor] = field(default_factory=dict)
-    """What density control has found and decided so far, without rows; entries may be added at any step."""
+    """Findings and decisions of density control, without rows; entries may be added at any step."""
     pace: float = 1.0
-    """All learning rates are multiplied by it (`training.cooldown`)."""
+    """Factor of all learning rates (`training.cooldown`)."""
+    former_names: Mapping[str, str] = field(default_factory=dict)
+    """Names of parameters in old checkpoints, by their names of today."""
     optimiser: torch.optim.Adam = field(init=False)
 
     def __post_init__(self) -> None:
-        groups = [{"params": [parameter], "name": name, "lr": 0.0} for name, parameter in self.parameters.items()]
-        self.optimiser = torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)
+        self.optimiser = adam({name: [parameter] for name, parameter in self.parameters.items()})
 
     def __len__(self) -> int:
         return len(next(iter(self.parameters.values())))
@@ -101,18 +109,21 @@ class ParameterTable:
         return ChainMap[str, Tensor](self.parameters, self.columns, self.statistics)[name]  # type: ignore[arg-type]
 
     def set_rate(self, name: str, rate: float) -> None:
-        """Learning rate of one parameter."""
+        """Sets the learning rate of one parameter."""
         self.group(name)["lr"] = rate
 
     def group(self, name: str) -> dict:
-        """The Adam group of one parameter."""
-        return group_named(self.optimiser, name)
+        """Returns the Adam group of one parameter."""
+        return group_of(self.optimiser, name)
+
+
+# -- rows --------------------------------------------------------------------------------------------------------------
 
 
 def edit(
     table: ParameterTable, name: str, change: Callable[[Tensor], Tensor], moments: Callable[[Tensor], Tensor]
 ) -> None:
-    """Replace a parameter by `change` of it and its Adam moments by `moments` of them."""
+    """Replaces a parameter by `change` of it and its Adam moments by `moments` of them."""
     old = table.parameters[name]
     new = Parameter(change(old.detach()).contiguous())
     state = table.optimiser.state.pop(old, None)
@@ -127,13 +138,15 @@ def edit(
 
 
 def appending(new: Tensor) -> Callable[[Tensor], Tensor]:
-    """A function that appends `new` to the rows of a tensor."""
+    """Returns a function that appends `new` to the rows of a tensor."""
     return lambda old: torch.cat([old, new])
 
 
 def append_rows(table: ParameterTable, rows: dict[str, Tensor], squares: Mapping[str, Tensor] | None = None) -> None:
-    """Append rows to every parameter and column; `rows` names all of them. Moments and statistics begin with 0, second
-    moments with `squares` where these are given."""
+    """Appends rows to every parameter and column; `rows` names all of them.
+
+    Moments and statistics begin with 0, second moments with `squares` where these are given.
+    """
     count = len(next(iter(rows.values())))
     for name in table.parameters:
         edit(table, name, appending(rows[name]), appending(torch.zeros_like(rows[name])))
@@ -146,81 +159,55 @@ def append_rows(table: ParameterTable, rows: dict[str, Tensor], squares: Mapping
 
 
 def keep_rows(table: ParameterTable, kept: Bool[Tensor, "N"]) -> None:
-    """Keep the marked rows of every parameter, with their moments, of every column, and of the statistics."""
+    """Keeps the marked rows of every parameter, with their moments, of every column, and of the statistics."""
     for name in table.parameters:
         edit(table, name, lambda old: old[kept], lambda moment: moment[kept])
-    for name, column in table.columns.items():
-        table.columns[name] = column[kept]
-    for name, sums in table.statistics.items():
-        table.statistics[name] = sums[kept]
+    for values in (table.columns, table.statistics):
+        values |= {name: value[kept] for name, value in values.items()}
+
+
+def reset_column(table: ParameterTable, name: str, values: Tensor) -> None:
+    """Replaces all values of one parameter and zeroes its moments."""
+    edit(table, name, lambda old: values, torch.zeros_like)
 
 
 def detached_rows(table: ParameterTable) -> dict[str, Tensor]:
-    """All parameters and columns by name, without gradient: what `append_rows` wants rows of."""
+    """Returns all parameters and columns by name, without gradient: what `append_rows` needs rows of."""
     return {name: parameter.detach() for name, parameter in table.parameters.items()} | table.columns
 
 
 def second_moments(table: ParameterTable) -> dict[str, Tensor]:
-    """Those of Adam by the name of the parameter, of parameters that have learnt."""
+    """Returns Adam's second moments by the name of the parameter, of parameters that have learnt."""
     states = {name: table.optimiser.state.get(parameter) for name, parameter in table.parameters.items()}
     return {name: state["exp_avg_sq"] for name, state in states.items() if state}
 
 
-def reset_column(table: ParameterTable, name: str, values: Tensor) -> None:
-    """Replace all values of one parameter and zero its moments."""
-    edit(table, name, lambda old: values, torch.zeros_like)
-
-
-def adam_tensors(name: str, parameter: Parameter, optimiser: torch.optim.Adam) -> dict[str, Tensor]:
-    """Adam's step count and moments of one parameter, by the names they are saved under; none before its first step."""
-    return {f"adam.{name}.{key}": value for key, value in optimiser.state.get(parameter, {}).items()}
-
-
-def restore_adam(
-    name: str, parameter: Parameter, optimiser: torch.optim.Adam, tensors: dict[str, Tensor], device: torch.device
-) -> None:
-    """Take back what `adam_tensors` gave."""
-    if f"adam.{name}.step" in tensors:
-        shapes = {"step": torch.Size(), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
-        state = {key: saved(f"adam.{name}.{key}", shape, tensors) for key, shape in shapes.items()}
-        optimiser.state[parameter] = {key: value.to(device) for key, value in state.items()}
-
-
-def saved(name: str, shape: torch.Size, tensors: dict[str, Tensor]) -> Tensor:
-    """A tensor of a checkpoint.
-
-    Raises:
-        CheckpointError: there is none of that shape.
-    """
-    if name not in tensors or tensors[name].shape != shape:
-        raise CheckpointError(f"the checkpoint holds no {name} of shape {list(shape)}: remove it to use an older one")
-    return tensors[name]
+# -- steps -------------------------------------------------------------------------------------------------------------
 
 
 def named_parameters(table: ParameterTable) -> list[tuple[str, Parameter]]:
-    """Name and value of everything that is learnt, in the same order on every process."""
+    """Returns name and value of everything that is learnt, in the same order on every process."""
     return [*table.parameters.items(), *(table.networks.named() if table.networks else ())]
 
 
 def gradients(table: ParameterTable) -> dict[str, Tensor]:
-    """Gradients by name, of the parameters that have one."""
+    """Returns gradients by name, of the parameters that have one."""
     return {name: parameter.grad for name, parameter in named_parameters(table) if parameter.grad is not None}
 
 
 def shared_colour(table: ParameterTable) -> list[Parameter]:
-    """Parameters of colour that all primitives share; pseudo views may leave them alone."""
+    """Returns parameters of colour that all primitives share; pseudo views may leave them alone."""
     return [] if table.networks is None else list(table.networks.colour.parameters())
 
 
 def zero_grad(table: ParameterTable) -> None:
-    """Clear all gradients without moving anything."""
+    """Clears all gradients without moving anything."""
     for _, parameter in named_parameters(table):
         parameter.grad = None
 
 
 def take_adam_step(table: ParameterTable) -> None:
-    """Move everything that has a gradient by the learning rates set, times the table's pace; then clear the
-    gradients."""
+    """Moves everything that has a gradient by its learning rate times the table's pace; then clears the gradients."""
     networks = [] if table.networks is None else [table.networks.optimiser]
     for optimiser in [table.optimiser, *networks]:
         with paced(optimiser, table.pace):
@@ -230,7 +217,7 @@ def take_adam_step(table: ParameterTable) -> None:
 
 @contextmanager
 def paced(optimiser: torch.optim.Optimizer, pace: float) -> Iterator[None]:
-    """Learning rates are multiplied by that for a while."""
+    """Multiplies learning rates by `pace` inside the block."""
     rates = [group["lr"] for group in optimiser.param_groups]
     try:
         for group, rate in zip(optimiser.param_groups, rates, strict=True):
@@ -242,7 +229,7 @@ def paced(optimiser: torch.optim.Optimizer, pace: float) -> Iterator[None]:
 
 
 def size_of(table: ParameterTable) -> tuple[int, int]:
-    """(rows, bytes of what a render needs: parameters, columns and networks)."""
+    """Returns (rows, bytes of what a render needs: parameters, columns and networks)."""
     needed = [*(parameter for _, parameter in named_parameters(table)), *table.columns.values()]
     return len(table), sum(value.numel() * value.element_size() for value in needed)
 
@@ -250,15 +237,35 @@ def size_of(table: ParameterTable) -> tuple[int, int]:
 # -- checkpoints -------------------------------------------------------------------------------------------------------
 
 
-RECORD = "record."
-"""Before the names that entries of a record are saved under."""
+def adam_tensors(name: str, parameter: Parameter, optimiser: torch.optim.Adam) -> dict[str, Tensor]:
+    """Returns Adam's step count and moments of one parameter, by their names in checkpoints; none before a step."""
+    return {f"adam.{name}.{key}": value for key, value in optimiser.state.get(parameter, {}).items()}
+
+
+def restore_adam(name: str, parameter: Parameter, optimiser: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
+    """Restores what `adam_tensors` returned."""
+    if f"adam.{name}.step" in tensors:
+        shapes = {"step": torch.Size(), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
+        state = {key: saved(f"adam.{name}.{key}", shape, tensors) for key, shape in shapes.items()}
+        optimiser.state[parameter] = {key: value.to(parameter.device) for key, value in state.items()}
+
+
+def saved(name: str, shape: torch.Size, tensors: dict[str, Tensor]) -> Tensor:
+    """Returns a tensor of a checkpoint.
+
+    Raises:
+        CheckpointError: there is none of that shape.
+    """
+    if name not in tensors or tensors[name].shape != shape:
+        raise CheckpointError(f"the checkpoint holds no {name} of shape {list(shape)}: remove it to use an older one")
+    return tensors[name]
 
 
 def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
-    """Everything of a table, by the names it is saved under."""
+    """Returns everything of a table by its names in checkpoints."""
     out = {f"columns.{name}": column for name, column in table.columns.items()}
     out |= {f"statistics.{name}": sums for name, sums in table.statistics.items()}
-    out |= {f"{RECORD}{name}": found for name, found in table.record.items()}
+    out |= {f"{RECORD}{name}": entry for name, entry in table.record.items()}
     for name, parameter in table.parameters.items():
         out[f"parameters.{name}"] = parameter.detach()
         out |= adam_tensors(name, parameter, table.optimiser)
@@ -271,35 +278,44 @@ def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
 
 
 def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> ParameterTable:
-    """The table that `table_tensors` saw, whatever its number of rows, with all that `like` has and its learning rates.
+    """Restores what `table_tensors` returned, whatever its number of rows, with learning rates and networks of `like`.
+
     Of the record all that was saved comes back, whether `like` has it by now or not.
 
     Raises:
         CheckpointError: something of it was not saved: the run had other options.
     """
-    if "sh_dc" in like.parameters and "parameters.sh_dc" not in tensors:  # as it was called once
-        tensors = {name.replace(".sh_constant", ".sh_dc"): value for name, value in tensors.items()}
-    found = {kind: saved_rows(kind, vars(like)[kind], tensors) for kind in ("parameters", "columns", "statistics")}
+    for name, former in like.former_names.items():
+        if name in like.parameters and f"parameters.{name}" not in tensors:
+            tensors = {key.replace(f".{former}", f".{name}"): value for key, value in tensors.items()}
     device = like.device
-    rows = {kind: {name: value.to(device) for name, value in values.items()} for kind, values in found.items()}
+    rows = {kind: saved_rows(kind, vars(like)[kind], tensors) for kind in ("parameters", "columns", "statistics")}
+    rows = {kind: {name: value.to(device) for name, value in values.items()} for kind, values in rows.items()}
     parameters = {name: Parameter(value) for name, value in rows["parameters"].items()}
     written = {name[len(RECORD) :]: value.to(device) for name, value in tensors.items() if name.startswith(RECORD)}
-    record = written | {name: written.get(name, found).to(found) for name, found in like.record.items()}
-    table = ParameterTable(parameters, rows["columns"], rows["statistics"], like.networks, record)
+    record = written | {name: written.get(name, entry).to(entry) for name, entry in like.record.items()}
+    table = ParameterTable(
+        parameters, rows["columns"], rows["statistics"], like.networks, record, former_names=like.former_names
+    )
     for name, parameter in table.parameters.items():
         table.set_rate(name, like.group(name)["lr"])
-        restore_adam(name, parameter, table.optimiser, tensors, device)
-    if (networks := table.networks) is not None:
-        for name, parameter in networks.named():
-            parameter.data.copy_(saved(name, parameter.shape, tensors))
-            restore_adam(name, parameter, networks.optimiser, tensors, device)
-        for name, buffer in networks.buffers():
-            buffer.copy_(saved(name, buffer.shape, tensors))
+        restore_adam(name, parameter, table.optimiser, tensors)
+    if table.networks is not None:
+        restore_networks(table.networks, tensors)
     return table
 
 
+def restore_networks(networks: Networks, tensors: dict[str, Tensor]) -> None:
+    """Restores parameters, Adam state and buffers of networks."""
+    for name, parameter in networks.named():
+        parameter.data.copy_(saved(name, parameter.shape, tensors))
+        restore_adam(name, parameter, networks.optimiser, tensors)
+    for name, buffer in networks.buffers():
+        buffer.copy_(saved(name, buffer.shape, tensors))
+
+
 def saved_rows(kind: str, like: dict[str, Tensor], tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The saved values of one kind, by name; older checkpoints hold some statistics as columns."""
+    """Returns the saved values of one kind, by name; older checkpoints hold some statistics as columns."""
     kinds = (kind, "columns") if kind == "statistics" else (kind,)
     names = {name: next((f"{k}.{name}" for k in kinds if f"{k}.{name}" in tensors), "") for name in like}
     missing = [name for name, key in names.items() if not key]

@@ -17,7 +17,7 @@ from gsx.core.gaussians.splats import Gaussians
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
-from gsx.core.training.distributed import Ranks, ranks_here
+from gsx.core.training.distributed import Ranks, current_ranks
 from gsx.core.training.module import ModuleContext, Modules
 from gsx.core.training.photo_cache import PhotoCache, room_for_photos
 from gsx.core.training.regenerator import Regenerator
@@ -56,7 +56,7 @@ def placed(device: torch.device) -> torch.device:
     Raises:
         ConfigError: there are fewer GPUs than ranks on this machine.
     """
-    if device.type != "cuda" or ranks_here().size == 1:
+    if device.type != "cuda" or current_ranks().size == 1:
         return device
     own, count = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
     if own >= count:
@@ -162,7 +162,7 @@ def build(
     Raises:
         ConfigError: the backbone cannot begin with a file.
     """
-    general, ranks = settings.general, ranks_here()
+    general, ranks = settings.general, current_ranks()
     device = placed(choose_device(general.device))
     if training:
         refuse_uneven(settings.training.batch, ranks)

@@ -16,7 +16,7 @@ from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training import checkpoint
 from gsx.core.training.augmenter import recall_accounts
-from gsx.core.training.distributed import ranks_here
+from gsx.core.training.distributed import current_ranks
 from gsx.core.training.run import Run
 from gsx.engine.cache import source_revision
 from gsx.engine.collector import gc_paused
@@ -92,7 +92,7 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
     Raises:
         ConfigError, InputError: something is wrong; no folder was made.
     """
-    ranks = ranks_here()
+    ranks = current_ranks()
     choose_device(settings.general.device)  # an unknown one is refused now
     ranks.broadcast(lambda: refuse_used(settings.general.folder))
     refuse_uneven(settings.training.batch, ranks)
@@ -191,7 +191,7 @@ def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     """Returns the run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
     origin = trained_origin(folder)
     checked = verified if training else (lambda scene: scene)
-    scene = ranks_here().rank0_first(lambda: checked(load_scene(settings, origin)))
+    scene = current_ranks().rank0_first(lambda: checked(load_scene(settings, origin)))
     run = build(settings, scene, folder, training, begins=False)
     checkpoint.restore(run, training)
     focal = read_run(folder).environment.get("training_focal")
