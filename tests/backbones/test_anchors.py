@@ -69,7 +69,7 @@ def stir(backbone: Anchors) -> None:
 
 
 def cameras_of(backbone: Anchors) -> list[Camera]:
-    return [view.camera for view in backbone.scene.train]
+    return [view.camera for view in backbone.context.scene.train]
 
 
 def render(backbone: Anchors, camera: Camera, step: int) -> tuple[DrawnAnchors, Rendering]:

@@ -6,7 +6,7 @@ filters: each is a part that knows nothing of the others (docs/backbones.md).
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,19 +25,17 @@ from gsx.backbones.growth import clamp_scales, eligible, fresh_statistics, obser
 from gsx.backbones.heads import Heads
 from gsx.backbones.mip import filter_named
 from gsx.backbones.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
-from gsx.backbones.sky import far_away
+from gsx.backbones.scene_model import SceneModel
 from gsx.core.data.camera import Camera
-from gsx.core.data.scene import PointCloud, View
-from gsx.core.data.window import Window
+from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
 from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.quality.losses import volume_loss
 from gsx.core.rasterizer import Rendering, goes_compiled, touches
-from gsx.core.shapes import Bool, Float, Int
+from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import BackboneContext, Observation
 from gsx.core.training.parameter_table import Networks, ParameterTable, take_adam_step
-from gsx.core.training.pseudo_views import PseudoView
 
 
 def neural_anchors(options: NeuralOptions, context: BackboneContext) -> "Anchors":
@@ -72,7 +70,7 @@ class DrawnAnchors:
         return self.decoded.slots // self.decoded.opacities.shape[1]
 
 
-class Anchors:
+class Anchors(SceneModel):
     """N anchors at fixed places, k Gaussians each."""
 
     absolute_gradient = False
@@ -89,10 +87,10 @@ class Anchors:
     ) -> None:
         points = context.points()
         self.options, self.representation, self.sh, self.sh_degree = options, representation, sh, sh[0]
-        self.network_rates, self.scene, self.views = network_rates, context.scene, context.views
-        self.numbers = {view.camera: number for number, view in enumerate(self.scene.train)}
+        self.network_rates, self.context = network_rates, context
+        self.numbers = {view.camera: number for number, view in enumerate(context.scene.train)}
         self.schedule = context.schedule(options.published_iterations)
-        self.events = event_steps(options.growth, self.schedule)
+        self.events = event_steps(self.schedule, options.growth.start, options.growth.stop, options.growth.every)
         self.filter = filter_named(options.filter, options.mip, context, self.schedule, self.events.stop)
         self.raster = self.filter.rules(context.raster)
         self.capacity = capacity_of(options, context, self.events)
@@ -127,7 +125,8 @@ class Anchors:
         """Returns the number of the training view with this camera, in the scene or at the step; -1: none."""
         if camera in self.numbers:
             return self.numbers[camera]
-        numbered = (pair for views in (self.views.full_size, self.views.at(step)) for pair in enumerate(views))
+        views = self.context.views
+        numbered = (pair for shown in (views.full_size, views.at(step)) for pair in enumerate(shown))
         return next((number for number, view in numbered if view.camera is camera), -1)
 
     def visible(self, camera: Camera, step: int) -> VisibleAnchors:
@@ -174,10 +173,6 @@ class Anchors:
         if observation:
             observe(self.table, **observation)
 
-    def pseudo_views_made(self, views: Sequence[PseudoView], step: int) -> None:
-        """Hands new pseudo views to the filter."""
-        self.filter.pseudo_views_made(views)
-
     def densify_and_prune(self, step: int) -> Mapping[str, float]:
         """Grows and prunes when due (Scaffold-GS, train.py)."""
         due = self.events.due(step)
@@ -191,10 +186,6 @@ class Anchors:
         """Returns when growth ends."""
         return [self.events.stop]
 
-    def validation_window(self, view: View, step: int) -> Window | None:
-        """Returns the window that capacity is measured by."""
-        return self.capacity.validation_window(self.table, view, step)
-
     def grow_and_prune(self, step: int) -> dict[str, float]:
         """Grows, zeroes eligible offsets, prunes, clamps: the order of the reference (Scaffold-GS)."""
         growth = self.options.growth
@@ -206,7 +197,7 @@ class Anchors:
         mark_newborn(self.table, old)
         reset_offsets(self.table, enough)
         pruned = prune(self.table, growth, visits)
-        extent = self.scene.extent
+        extent = self.context.scene.extent
         unit = math.log(extent) if self.options.switches().clamp == "extent" and extent > 0 else 0.0
         clamp_scales(self.table, growth.largest_log_scale + unit)
         metrics |= {"grown": grown, "pruned": pruned}
@@ -216,7 +207,7 @@ class Anchors:
         """Sets the learning rates of a step (Scaffold-GS, training_setup)."""
         steps = self.schedule.step(self.options.decay_until or self.options.published_iterations)
         for name in self.table.parameters:
-            unit = self.scene.extent if name == "offsets" else 1.0
+            unit = self.context.scene.extent if name == "offsets" else 1.0
             self.table.set_rate(name, unit * getattr(self.options.rates, name).at(step, steps))
         if networks := self.table.networks:
             for name in networks.names():
@@ -232,10 +223,6 @@ class Anchors:
         take_adam_step(self.table)
         if "quats" in self.table.parameters:
             make_identity_where_zero(self.table["quats"])
-
-    def behind_scene(self, means: Float[Tensor, "M 3"]) -> Bool[Tensor, "M"]:
-        """Marks splats that stand where a sky does."""
-        return far_away(means, self.scene)
 
     # -- files and logs ----------------------------------------------------------------------------------------
 
@@ -266,7 +253,7 @@ class Anchors:
         every = VisibleAnchors(
             rows=torch.arange(len(anchors), device=anchors.device),
             weights=torch.ones_like(anchors[:, 0]),
-            camera=self.scene.train[0].camera,
+            camera=self.context.scene.train[0].camera,
             view=-1,
             sh_degree=self.sh[0],
         )

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,18 +35,6 @@ class BudgetOptions:
     """At a share t of the growth there may be first + (primitives - first) t^power (Improved-GS: a square root)."""
 
 
-@runtime_checkable
-class Timed(Protocol):
-    """Options of density control in steps of the published run."""
-
-    @property
-    def start(self) -> int: ...
-    @property
-    def stop(self) -> int: ...
-    @property
-    def every(self) -> int: ...
-
-
 @dataclass(frozen=True)
 class EventSteps:
     """The steps at which density control acts: multiples of `every` between `start` and `stop`, both left out."""
@@ -76,10 +64,10 @@ class EventSteps:
         return min(1.0, max(0.0, (step // self.every - self.start // self.every) / max(1, self.count())))
 
 
-def event_steps(options: Timed, schedule: Schedule) -> EventSteps:
-    """Returns when density control acts in this run, to its last step at most: what learns afterwards does not grow."""
-    stop = min(schedule.step(options.stop), schedule.iterations + 1)
-    return EventSteps(schedule.step(options.start), stop, schedule.interval(options.every))
+def event_steps(schedule: Schedule, start: int, stop: int, every: int) -> EventSteps:
+    """Rescales published steps of density control; it ends with the run: what learns afterwards does not grow."""
+    stop = min(schedule.step(stop), schedule.iterations + 1)
+    return EventSteps(schedule.step(start), stop, schedule.interval(every))
 
 
 class Capacity:

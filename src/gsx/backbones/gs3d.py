@@ -1,7 +1,7 @@
 """3D Gaussian Splatting (Kerbl et al. 2023): explicit Gaussians with adaptive density control (3D-GS)."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -17,23 +17,22 @@ from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.long_axis import LongAxis
 from gsx.backbones.mip import absorb, filter_named
 from gsx.backbones.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
+from gsx.backbones.scene_model import SceneModel
 from gsx.backbones.sh_degrees import ChosenDegrees, choose_degrees, hold_bands, lower_degrees, numbers_of
 from gsx.backbones.sky import NOTHING, SKY_OPACITY, WIDEST, far_away, sky_behind
 from gsx.backbones.visibility import Shown, Visibility, everything, extents
 from gsx.core.data.camera import Camera, offsets_from
-from gsx.core.data.scene import PointCloud, View
-from gsx.core.data.window import Window
+from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
 from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.sh import colours_of, constant_from_colour, degree_of
 from gsx.core.gaussians.smoothing import logit_of_log, unsmoothed
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering, goes_compiled
-from gsx.core.shapes import Bool, Float, Int
+from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import BackboneContext, DrawnSplats, Observation
 from gsx.core.training.importance import Probe, random_views
 from gsx.core.training.parameter_table import ParameterTable, take_adam_step
-from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.schedule import log_linear
 from gsx.formats.splat_files import columns_of
 
@@ -80,7 +79,7 @@ def gs3d(options: GS3DOptions, context: BackboneContext) -> "GS3D":
     return GS3D(options, context, Visibility(), control)
 
 
-class GS3D:
+class GS3D(SceneModel):
     """Explicit Gaussians, N rows in every parameter."""
 
     def __init__(
@@ -179,14 +178,6 @@ class GS3D:
         if observation:
             add_statistics(self.table, observation)
 
-    def validation_window(self, view: View, step: int) -> Window | None:
-        """Returns the window that capacity is measured by."""
-        return self.capacity.validation_window(self.table, view, step)
-
-    def pseudo_views_made(self, views: Sequence[PseudoView], step: int) -> None:
-        """Hands new pseudo views to the filter."""
-        self.filter.pseudo_views_made(views)
-
     def densify_and_prune(self, step: int) -> dict[str, float]:
         """Removes rows in empty space once; clones, splits, prunes and resets when due."""
         metrics = self.capacity.remove_empty(self.table, self.table["means"]) if step == 1 else {}
@@ -249,10 +240,6 @@ class GS3D:
         self.set_rates(step)
         take_adam_step(self.table)
         make_identity_where_zero(self.table["quats"])
-
-    def behind_scene(self, means: Float[Tensor, "M 3"]) -> Bool[Tensor, "M"]:
-        """Marks splats that stand where a sky does."""
-        return far_away(means, self.context.scene)
 
     # -- files and logs ----------------------------------------------------------------------------------------
 

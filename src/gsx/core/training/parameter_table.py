@@ -237,28 +237,13 @@ def size_of(table: ParameterTable) -> tuple[int, int]:
 # -- checkpoints -------------------------------------------------------------------------------------------------------
 
 
-def adam_tensors(name: str, parameter: Parameter, optimiser: torch.optim.Adam) -> dict[str, Tensor]:
-    """Returns Adam's step count and moments of one parameter, by their names in checkpoints; none before a step."""
-    return {f"adam.{name}.{key}": value for key, value in optimiser.state.get(parameter, {}).items()}
-
-
-def restore_adam(name: str, parameter: Parameter, optimiser: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
-    """Restores what `adam_tensors` returned."""
-    if f"adam.{name}.step" in tensors:
-        shapes = {"step": torch.Size(), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
-        state = {key: saved(f"adam.{name}.{key}", shape, tensors) for key, shape in shapes.items()}
-        optimiser.state[parameter] = {key: value.to(parameter.device) for key, value in state.items()}
-
-
-def saved(name: str, shape: torch.Size, tensors: dict[str, Tensor]) -> Tensor:
-    """Returns a tensor of a checkpoint.
-
-    Raises:
-        CheckpointError: there is none of that shape.
-    """
-    if name not in tensors or tensors[name].shape != shape:
-        raise CheckpointError(f"the checkpoint holds no {name} of shape {list(shape)}: remove it to use an older one")
-    return tensors[name]
+def learnt(table: ParameterTable) -> Iterator[tuple[str, str, Parameter, torch.optim.Adam]]:
+    """Yields (key in checkpoints, name, parameter, its optimiser) of everything that is learnt."""
+    for name, parameter in table.parameters.items():
+        yield f"parameters.{name}", name, parameter, table.optimiser
+    if table.networks is not None:
+        for name, parameter in table.networks.named():
+            yield name, name, parameter, table.networks.optimiser
 
 
 def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
@@ -266,14 +251,11 @@ def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
     out = {f"columns.{name}": column for name, column in table.columns.items()}
     out |= {f"statistics.{name}": sums for name, sums in table.statistics.items()}
     out |= {f"{RECORD}{name}": entry for name, entry in table.record.items()}
-    for name, parameter in table.parameters.items():
-        out[f"parameters.{name}"] = parameter.detach()
-        out |= adam_tensors(name, parameter, table.optimiser)
-    if (networks := table.networks) is not None:
-        for name, parameter in networks.named():
-            out[name] = parameter.detach()
-            out |= adam_tensors(name, parameter, networks.optimiser)
-        out |= {name: buffer.detach() for name, buffer in networks.buffers()}
+    for key, name, parameter, optimiser in learnt(table):
+        out[key] = parameter.detach()
+        out |= {f"adam.{name}.{entry}": value for entry, value in optimiser.state.get(parameter, {}).items()}
+    if table.networks is not None:
+        out |= {name: buffer.detach() for name, buffer in table.networks.buffers()}
     return out
 
 
@@ -288,30 +270,41 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> Paramete
     for name, former in like.former_names.items():
         if name in like.parameters and f"parameters.{name}" not in tensors:
             tensors = {key.replace(f".{former}", f".{name}"): value for key, value in tensors.items()}
-    device = like.device
     rows = {kind: saved_rows(kind, vars(like)[kind], tensors) for kind in ("parameters", "columns", "statistics")}
-    rows = {kind: {name: value.to(device) for name, value in values.items()} for kind, values in rows.items()}
+    rows = {kind: {name: value.to(like.device) for name, value in values.items()} for kind, values in rows.items()}
     parameters = {name: Parameter(value) for name, value in rows["parameters"].items()}
-    written = {name[len(RECORD) :]: value.to(device) for name, value in tensors.items() if name.startswith(RECORD)}
-    record = written | {name: written.get(name, entry).to(entry) for name, entry in like.record.items()}
+    record = {key[len(RECORD) :]: value.to(like.device) for key, value in tensors.items() if key.startswith(RECORD)}
+    record |= {name: record.get(name, entry).to(entry) for name, entry in like.record.items()}
     table = ParameterTable(
         parameters, rows["columns"], rows["statistics"], like.networks, record, former_names=like.former_names
     )
-    for name, parameter in table.parameters.items():
+    for name in table.parameters:
         table.set_rate(name, like.group(name)["lr"])
-        restore_adam(name, parameter, table.optimiser, tensors)
-    if table.networks is not None:
-        restore_networks(table.networks, tensors)
+    for key, name, parameter, optimiser in learnt(table):
+        parameter.data.copy_(saved(key, parameter.shape, tensors))
+        restore_adam(name, parameter, optimiser, tensors)
+    for name, buffer in table.networks.buffers() if table.networks is not None else ():
+        buffer.copy_(saved(name, buffer.shape, tensors))
     return table
 
 
-def restore_networks(networks: Networks, tensors: dict[str, Tensor]) -> None:
-    """Restores parameters, Adam state and buffers of networks."""
-    for name, parameter in networks.named():
-        parameter.data.copy_(saved(name, parameter.shape, tensors))
-        restore_adam(name, parameter, networks.optimiser, tensors)
-    for name, buffer in networks.buffers():
-        buffer.copy_(saved(name, buffer.shape, tensors))
+def restore_adam(name: str, parameter: Parameter, optimiser: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
+    """Restores Adam's step count and moments of one parameter; none before its first step."""
+    if f"adam.{name}.step" in tensors:
+        shapes = {"step": torch.Size(), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
+        state = {key: saved(f"adam.{name}.{key}", shape, tensors) for key, shape in shapes.items()}
+        optimiser.state[parameter] = {key: value.to(parameter.device) for key, value in state.items()}
+
+
+def saved(key: str, shape: torch.Size, tensors: dict[str, Tensor]) -> Tensor:
+    """Returns a tensor of a checkpoint.
+
+    Raises:
+        CheckpointError: there is none of that shape.
+    """
+    if key not in tensors or tensors[key].shape != shape:
+        raise CheckpointError(f"the checkpoint holds no {key} of shape {list(shape)}: remove it to use an older one")
+    return tensors[key]
 
 
 def saved_rows(kind: str, like: dict[str, Tensor], tensors: dict[str, Tensor]) -> dict[str, Tensor]:

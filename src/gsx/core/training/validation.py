@@ -1,4 +1,4 @@
-"""Windows of training views that count in no loss for a while, and what steps or primitives have gained in them."""
+"""Windows of training views that count in no loss for a while, and the gain in dB that they measure."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,8 +16,7 @@ from gsx.core.training.importance import rounding_of
 def validation_windows(
     views: Sequence[View], count: int, share: float, purpose: str, number: int
 ) -> dict[View, Window]:
-    """Windows with a share of the sides of so many views. Which, and where, comes from purpose and number alone, not
-    from the run's seed."""
+    """Picks windows with a share of the sides of `count` views, by purpose and number alone, not by the run's seed."""
     generator = torch.Generator().manual_seed(derived_seed(purpose, number))
     order = torch.randperm(len(views), generator=generator)[:count].tolist()
     corners = torch.rand(len(order), 2, generator=generator).tolist()
@@ -26,23 +25,21 @@ def validation_windows(
 
 
 def part_of(view: View, share: float, right: float, down: float) -> Window:
-    """A window with that share of a view's sides; where it lies, from 0 (left, top) to 1."""
+    """Returns a window with a share of a view's sides; its place from 0 (left, top) to 1."""
     width, height = (max(1, round(share * side)) for side in view.camera.size)
     left, top = round(right * (view.camera.width - width)), round(down * (view.camera.height - height))
     return Window(left, top, width, height)
 
 
 def rounding_in(windows: Mapping[View, Window]) -> Float[Tensor, "W"]:
-    """Squared error of photographs' rounding to 8 bits in each window, summed over the values that count; 0 where
-    all are masked."""
+    """Returns the squared error of rounding to 8 bits in each window, over values that count; 0 if all are masked."""
     return torch.tensor([rounding_of(view, window) for view, window in windows.items()])
 
 
-def decibels(has: Float[Tensor, "W"], had: Float[Tensor, "W"]) -> tuple[float, float]:
-    """(gain in dB from the squared errors `had` to `has`, summed over windows; its standard error over the windows): 0
-    and infinite where there are none."""
-    if not bool(had.any()):
+def decibels(after: Float[Tensor, "W"], before: Float[Tensor, "W"]) -> tuple[float, float]:
+    """Returns (gain in dB by squared errors `before` and `after`, its standard error); (0, inf) without windows."""
+    if not bool(before.any()):
         return 0.0, math.inf
-    gain = 10 * math.log10(float(had.sum() / has.sum()))
-    spread = float((had - has).std(correction=1)) * math.sqrt(len(has)) if len(has) > 1 else math.inf
-    return gain, 10 / math.log(10) * spread / float(had.sum())
+    gain = 10 * math.log10(float(before.sum() / after.sum()))
+    spread = float((before - after).std(correction=1)) * math.sqrt(len(after)) if len(after) > 1 else math.inf
+    return gain, 10 / math.log(10) * spread / float(before.sum())
