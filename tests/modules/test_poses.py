@@ -13,6 +13,7 @@ from small_scene import small_scene, spread
 from tiny import final_tensors, tiny_run, tiny_settings
 from torch import Tensor
 
+from gsx.backbones.anchors import view_number
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
@@ -264,8 +265,8 @@ def test_appearance_codes_go_with_photographs_whatever_their_pose(tmp_path: Path
     )
     assert coarse[0].camera.width == 48
     for views, step in ((run.views.at(1), 1), (run.train_views, 1), (run.train_views, 10), (own, 10)):
-        assert [run.backbone.photograph_of(view.camera, step) for view in views] == list(range(6))
-    assert run.backbone.photograph_of(run.scene.test[0].camera, 10) == -1
+        assert [view_number(run.backbone.numbers, run.views, view.camera, step) for view in views] == list(range(6))
+    assert view_number(run.backbone.numbers, run.views, run.scene.test[0].camera, 10) == -1
 
 
 def test_small_photographs_are_not_made_smaller(tmp_path: Path) -> None:

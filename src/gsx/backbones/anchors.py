@@ -36,6 +36,7 @@ from gsx.core.rasterizer import Rendering, goes_compiled, touches
 from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import BackboneContext, Observation
 from gsx.core.training.parameter_table import Networks, ParameterTable, take_adam_step
+from gsx.core.training.training_views import TrainingViews
 
 
 def neural_anchors(options: NeuralOptions, context: BackboneContext) -> "Anchors":
@@ -68,6 +69,14 @@ class DrawnAnchors:
     def rows(self) -> Int[Tensor, "M"]:
         """The anchor of each."""
         return self.decoded.slots // self.decoded.opacities.shape[1]
+
+
+def view_number(numbers: Mapping[Camera, int], views: TrainingViews, camera: Camera, step: int) -> int:
+    """Returns the number of the training view with this camera, in the scene or at the step; -1: none."""
+    if camera in numbers:
+        return numbers[camera]
+    numbered = (pair for shown in (views.full_size, views.at(step)) for pair in enumerate(shown))
+    return next((number for number, view in numbered if view.camera is camera), -1)
 
 
 class Anchors(SceneModel):
@@ -121,14 +130,6 @@ class Anchors(SceneModel):
         anchors = self.visible(camera, step)
         return DrawnAnchors(decoded=self.representation.decode(self.table, anchors, self.filter), anchors=anchors)
 
-    def photograph_of(self, camera: Camera, step: int) -> int:
-        """Returns the number of the training view with this camera, in the scene or at the step; -1: none."""
-        if camera in self.numbers:
-            return self.numbers[camera]
-        views = self.context.views
-        numbered = (pair for shown in (views.full_size, views.at(step)) for pair in enumerate(shown))
-        return next((number for number, view in numbered if view.camera is camera), -1)
-
     def visible(self, camera: Camera, step: int) -> VisibleAnchors:
         """Returns anchors of the levels that the camera draws, of which those in view (Octree-GS; Scaffold-GS)."""
         rows, weights = self.grid.visible(self.table, camera, step)
@@ -141,7 +142,7 @@ class Anchors(SceneModel):
             rows=rows,
             weights=weights[rows],
             camera=camera,
-            view=self.photograph_of(camera, step),
+            view=view_number(self.numbers, self.context.views, camera, step),
             sh_degree=degree,
             compiled=goes_compiled(self.raster, weights.device.type),
         )

@@ -73,6 +73,22 @@ def colours_from(
     return colours_of(values["sh_dc"], values["sh_rest"], offsets, degree, compiled)
 
 
+def choose_sh_degrees(model: "GS3D", step: int) -> dict[str, float]:
+    """Keeps the bands of colour that change renders of training views by more than their price."""
+    highest, context, price = model.active_degree(step), model.context, model.options.sh_price
+    if not highest:
+        return {}
+    other = sum(value[0].numel() for name, value in model.table.parameters.items() if not name.startswith("sh_"))
+    views = random_views(context.views.at(step), MOST_VIEWS, context.generator)
+
+    def estimate() -> ChosenDegrees:
+        probe = Probe(model=model, views=context.views, step=step)
+        fits = colour_fits(probe, views, context.generator, highest - 1)
+        return choose_degrees(fits, price, numbers_of(highest, other)).to("cpu")
+
+    return lower_degrees(model.table, context.on_rank0(estimate).to(context.device), step, price)
+
+
 def gs3d(options: GS3DOptions, context: BackboneContext) -> "GS3D":
     """Builds the backbones gs3d, gs3d_zoom and mip_splatting."""
     control = (CloneSplit if options.capacity == "published" else LongAxis)(options, context)
@@ -191,7 +207,7 @@ class GS3D(SceneModel):
             self.control.reset_opacities(self.table, self.filter)
             metrics["opacity_resets"] = 1
         if step == self.sh_step():
-            metrics |= self.choose_degrees(step)
+            metrics |= choose_sh_degrees(self, step)
         return metrics
 
     def settles(self) -> list[int]:
@@ -201,21 +217,6 @@ class GS3D(SceneModel):
     def sh_step(self) -> int:
         """Returns the step at which SH degrees are chosen; 0: at none."""
         return round(self.options.sh_judged * self.schedule.iterations)
-
-    def choose_degrees(self, step: int) -> dict[str, float]:
-        """Keeps the bands of colour that change renders of training views by more than their price."""
-        highest, context, price = self.active_degree(step), self.context, self.options.sh_price
-        if not highest:
-            return {}
-        other = sum(value[0].numel() for name, value in self.table.parameters.items() if not name.startswith("sh_"))
-        views = random_views(context.views.at(step), MOST_VIEWS, context.generator)
-
-        def estimate() -> ChosenDegrees:
-            probe = Probe(model=self, views=context.views, step=step)
-            fits = colour_fits(probe, views, context.generator, highest - 1)
-            return choose_degrees(fits, price, numbers_of(highest, other)).to("cpu")
-
-        return lower_degrees(self.table, context.on_rank0(estimate).to(context.device), step, price)
 
     def means_rate_steps(self) -> int:
         """Returns the step at which the learning rate of the means has come down."""
