@@ -20,23 +20,18 @@ from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.plugins import hookimpl
 from gsx.core.quality.metrics import psnr
+from gsx.core.training import importance
 from gsx.core.training.parameter_table import append_rows, detached_rows, keep_rows
 from gsx.core.training.render import render
 from gsx.core.training.run import Run, StepResult
+from gsx.core.training.trainer import train_step
 from gsx.experiments.compact import compact as compacting
-from gsx.experiments.compact.compact import File, compact
+from gsx.experiments.compact import shrink
+from gsx.experiments.compact.compact import compact
+from gsx.experiments.compact.fine_tuning import copied_model, fine_tuned, split_views
+from gsx.experiments.compact.quality import above_rounding, zoomed_psnr
 from gsx.experiments.compact.reduction import Reduction
-from gsx.experiments.compact.shrink import (
-    Shrinking,
-    ShrinkOptions,
-    Try,
-    above_rounding,
-    closer_window,
-    figures,
-    judges,
-    learn_on,
-    worth_of,
-)
+from gsx.experiments.compact.shrink import Candidate, Search, ShrinkOptions, closer_window, importance_of
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.load_scene import load_scene
@@ -79,15 +74,14 @@ def generator() -> torch.Generator:
 
 
 @pytest.fixture(scope="module")
-def prepared(folder: Path) -> Shrinking:
-    return Shrinking(opened(folder), ShrinkOptions(max_drop=0.0, steps=0, zooms=(1.0,)), plugins(), generator())
+def prepared(folder: Path) -> Search:
+    return Search(opened(folder), ShrinkOptions(max_drop=0.0, steps=0, zooms=(1.0,)), plugins(), generator())
 
 
 @pytest.fixture
-def shrinking(prepared: Shrinking) -> Shrinking:
-    """Of the whole model, which nothing has been tried on; tries learn nothing."""
-    prepared.tried = []
-    prepared.cut(0.0, prepared.untouched.degree, merging=False)
+def search(prepared: Search) -> Search:
+    """Nothing has been tried, nothing is learnt, and quantised files lose nothing."""
+    prepared.candidates, prepared.reserve = [], 0.0
     return prepared
 
 
@@ -109,7 +103,7 @@ def test_what_cannot_be_seen_is_worth_least(folder: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(importance, "DRAWS", 6)
     run = opened(folder)
     faint = add_faint(run)
-    worth = worth_of(run, run.scene.train, generator())
+    worth = importance_of(run, run.scene.train, generator())
     assert float(worth[faint].max()) < 1e-9 * float(worth.max())
     pictures = [render(run, view.camera).image for view in run.scene.train]
     Reduction(run.backbone.table, worth, None).apply(run.backbone.table, 0.5)
@@ -122,7 +116,7 @@ def test_worth_is_what_pictures_lose() -> None:
     """Renders without each of a few splats, at the views' own size; the mean over many signs."""
     run = opened_small()
     seeds, views = [torch.Generator().manual_seed(seed) for seed in range(10)], run.scene.train[:3]
-    worth = torch.stack([worth_of(run, views, seed) for seed in seeds]).mean(0)
+    worth = torch.stack([importance_of(run, views, seed) for seed in seeds]).mean(0)
     whole, changes = [render(run, view.camera).image for view in views], []
     for row in range(len(worth)):
         less = opened_small(without=row)
@@ -148,12 +142,12 @@ def opened_small(without: int | None = None) -> Run:
 
 def test_views_that_judge_are_not_learnt_from(folder: Path) -> None:
     run = opened(folder)
-    learnt, judging = judges(run)
+    learnt, judging = split_views(run)
     assert [len(learnt), len(judging)] == [4, 2]
     assert not {view.name for view in learnt} & {view.name for view in judging}
     few = replace(run.scene, train=run.scene.train[:2])
-    run.scene = few
-    assert judges(run) == (few.train, few.train)
+    run.views = replace(run.views, scene=few)
+    assert [len(part) for part in split_views(run)] == [2, 2]
 
 
 def test_a_window_is_the_middle_at_twice_the_focal_length(folder: Path) -> None:
@@ -170,74 +164,84 @@ def ahead(camera) -> Tensor:
     return (camera.centre + camera.rotation[2])[None].double()
 
 
-def test_learning_on_moves_no_rate_and_counts_no_step(folder: Path) -> None:
+def test_fine_tuning_leaves_the_run_as_it_was(folder: Path) -> None:
     run = opened(folder)
-    rows, step = len(run.backbone.table), run.step
-    before = run.backbone.table["means"].detach().clone()
-    learn_on(run, judges(run)[0], 1, 3, plugins())
-    assert (run.step, len(run.backbone.table), len(run.scene.train)) == (step, rows, 6)
-    assert not torch.equal(run.backbone.table["means"], before)
-    assert not run.backbone.table["sh_rest"][:, 3:].any()  # bands above degree 1
-    assert run.backbone.table["sh_rest"][:, :3].any()
+    before, seconds = run.backbone.table["means"].detach().clone(), run.progress.seconds
+    tuned = fine_tuned(run, split_views(run)[0], 1, 3, plugins())
+    assert torch.equal(run.backbone.table["means"], before)
+    assert (tuned.step, tuned.iterations, tuned.scene) == (run.step, run.iterations, run.scene)
+    assert tuned.progress.seconds == seconds
+    assert len(tuned.backbone.table) == len(before)
+    assert not torch.equal(tuned.backbone.table["means"], before)
+    assert not tuned.backbone.table["sh_rest"][:, 3:].any()  # bands above degree 1
+    assert tuned.backbone.table["sh_rest"][:, :3].any()
     rates = run.backbone.options.rates
-    assert run.backbone.table.group("means")["lr"] == pytest.approx(rates.means_last * run.scene.extent)
+    assert tuned.backbone.table.group("means")["lr"] == pytest.approx(rates.means_last * run.scene.extent)
 
 
-def test_it_learns_on_from_the_views_that_are_not_judged_by(folder: Path) -> None:
-    run, seen = opened(folder), list[str]()
+@pytest.mark.parametrize("backbone", ["gs3d", "octree_scaffold"])
+def test_copies_of_a_model_draw_alike_and_learn_apart(backbone: str) -> None:
+    settings = tiny_settings(Path("unused"), f"backbone={backbone}", "scene.points=100", "iterations=4")
+    run = build(settings, load_scene(settings), Path())
+    camera = run.scene.train[0].camera
+    copied = replace(run, backbone=copied_model(run))
+    before = render(run, camera).image
+    assert torch.equal(render(copied, camera).image, before)
+    train_step(copied, plugins())
+    assert torch.equal(render(run, camera).image, before)
+    assert not torch.equal(render(copied, camera).image, before)
+
+
+def test_fine_tuning_learns_from_its_views_alone(folder: Path) -> None:
+    run, learnt = opened(folder), list[str]()
 
     class Watching:
         @hookimpl
         def gsx_gradients_ready(self, run: Run, step: StepResult) -> None:
-            seen.append(step.view.name)
+            learnt.append(step.view.name)
 
-    learnt, judged = judges(run)
-    loaded, resolution = plugins(), run.views
+    training, validation = split_views(run)
+    loaded = plugins()
     with loaded.listening([Watching()]):
-        learn_on(run, learnt, 1, 2 * len(learnt), loaded)
-    assert sorted(set(seen)) == sorted(view.name for view in learnt)
-    assert not set(seen) & {view.name for view in judged}
-    assert run.views is resolution
+        fine_tuned(run, training, 1, 2 * len(training), loaded)
+    assert sorted(set(learnt)) == sorted(view.name for view in training)
+    assert not set(learnt) & {view.name for view in validation}
 
 
-def test_a_budget_that_nothing_meets_leaves_the_model_as_it_was(shrinking: Shrinking) -> None:
-    run = shrinking.run
-    before = run.backbone.table["means"].detach().clone()
-    shrinking.options = replace(shrinking.options, max_drop=-5.0, tries=2)
-    best = shrinking.smallest()
-    assert best not in shrinking.tried
-    shrinking.take(best)
-    assert torch.equal(run.backbone.table["means"], before)
+def test_a_budget_that_nothing_meets_leaves_the_model_as_it_was(search: Search) -> None:
+    search.options = replace(search.options, max_drop=-5.0, tries=2)
+    best = search.smallest()
+    assert best is search.untouched
+    assert search.trained(best) is search.run
 
 
-def test_a_try_knows_nothing_of_the_others_exposures(folder: Path) -> None:
+def test_a_candidate_knows_nothing_of_the_others_exposures(folder: Path) -> None:
     run = opened(folder)
     run.modules["exposure"].start(torch.eye(3, 4).repeat(len(run.train_views), 1, 1))
-    tried = Shrinking(run, ShrinkOptions(max_drop=0.0, steps=2, zooms=(1.0,)), plugins(), generator())
+    search = Search(run, ShrinkOptions(max_drop=0.0, steps=2, zooms=(1.0,)), plugins(), generator())
     drops = []
     for share in (0.25, 0.5, 0.25):
-        tried.tried.clear()  # or the third try would be the first
-        drops.append(tried.attempt(share, tried.untouched.degree, False).drop)
+        search.candidates.clear()  # or the third would be the first
+        drops.append(search.evaluate(share, search.untouched.degree, False).drop)
     assert drops[0] == drops[2]
-    tried.take(tried.untouched)
     assert torch.equal(
         run.modules["exposure"].state_dict()["matrices"], torch.eye(3, 4).repeat(len(run.train_views), 1, 1)
     )
 
 
-def with_drops(shrinking: Shrinking, drops: dict[int, float], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tries lose half a dB of the share of their rows, and what is given of their degree; nothing is learnt."""
-    rows = len(shrinking.worth)
+def with_drops(search: Search, drops: dict[int, float], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Candidates lose half a dB of the share of their rows, and `drops` by degree; nothing is learnt."""
+    rows = len(search.importance)
 
-    def judged(share: float, degree: int, merging: bool) -> Try:
+    def evaluate(share: float, degree: int, merging: bool) -> Candidate:
         left = round((1 - share) * rows)
-        size = left * shrinking.untouched.megabytes / rows * (14 + 3 * (degree + 1) ** 2 - 3) / (14 + 3 * 9 - 3)
+        size = left * search.untouched.megabytes / rows * (14 + 3 * (degree + 1) ** 2 - 3) / (14 + 3 * 9 - 3)
         drop = 0.5 * share + drops[degree] + (0.01 if merging else 0.0)
-        made = replace(shrinking.untouched, removed=share, degree=degree, merging=merging, megabytes=size, drop=drop)
-        shrinking.tried.append(made)
+        made = replace(search.untouched, removed=share, degree=degree, merging=merging, megabytes=size, drop=drop)
+        search.candidates.append(made)
         return made
 
-    monkeypatch.setattr(shrinking, "attempt", judged)
+    monkeypatch.setattr(search, "evaluate", evaluate)
 
 
 @pytest.mark.parametrize(
@@ -248,68 +252,29 @@ def with_drops(shrinking: Shrinking, drops: dict[int, float], monkeypatch: pytes
         ({2: 0.0, 1: 0.0, 0: 0.1}, 0, 0.4),  # 14 numbers of 60 % of the rows, not 23 of 40 %
     ],
 )
+@pytest.mark.parametrize("reserve", [0.0, 0.1])
 def test_the_smallest_within_the_budget_is_found(
-    shrinking: Shrinking, monkeypatch: pytest.MonkeyPatch, drops: dict[int, float], degree: int, most: float
+    search: Search, monkeypatch: pytest.MonkeyPatch, drops: dict[int, float], degree: int, most: float, reserve: float
 ) -> None:
-    """By drops that grow with the share, of which 0.3 dB are allowed."""
-    shrinking.options = replace(shrinking.options, max_drop=0.3, tries=5)
-    with_drops(shrinking, drops, monkeypatch)
-    best = shrinking.smallest()
-    assert [made.removed for made in shrinking.tried[2:7]] == [0.5, 0.75, 0.625, 0.5625, 0.59375]
-    assert [made.merging for made in shrinking.tried[:3]] == [True, False, False]
+    """By drops that grow with the share, of which 0.3 dB are allowed beside what a quantised file loses."""
+    search.options, search.reserve = replace(search.options, max_drop=0.3 + reserve, tries=5), reserve
+    with_drops(search, drops, monkeypatch)
+    best = search.smallest()
+    assert [made.removed for made in search.candidates[2:7]] == [0.5, 0.75, 0.625, 0.5625, 0.59375]
+    assert [made.merging for made in search.candidates[:3]] == [True, False, False]
     assert (best.degree, best.merging) == (degree, False)
     assert most - 1 / 32 < best.removed <= most
-    assert all(best.megabytes <= made.megabytes or made.drop > 0.3 for made in shrinking.tried)
+    assert all(best.megabytes <= made.megabytes or made.drop > 0.3 for made in search.candidates)
 
 
-@pytest.mark.parametrize(
-    ("lost", "taken"),
-    [
-        (0.005, 0.5),  # the smallest model's quantised file keeps the promise: 0.09 and 0.005 dB
-        (0.05, 0.25),  # the other model leaves room for it
-        (0.2, 0.5),  # none does
-    ],
-)
-def test_a_model_that_leaves_room_for_a_quantised_file_is_taken_if_its_file_is_smaller(
-    shrinking: Shrinking, monkeypatch: pytest.MonkeyPatch, lost: float, taken: float
+@pytest.mark.parametrize(("lost", "reserve"), [(0.04, 0.04), (0.2, 0.0)])
+def test_the_budget_reserves_what_a_quantised_file_loses_unless_that_is_most_of_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, lost: float, reserve: float
 ) -> None:
-    run = shrinking.run
-    rows = len(run.backbone.table)
-    shrinking.options = replace(shrinking.options, max_drop=0.1)
-    tries = [
-        replace(shrinking.untouched, removed=share, megabytes=(1 - share) * shrinking.untouched.megabytes, drop=drop)
-        for share, drop in ((0.5, 0.09), (0.25, 0.03), (0.75, 0.4))
-    ]
-    shrinking.tried += tries
-    shrinking.take(tries[0])
-
-    def sizes(run: Run, shrinking: Shrinking, to: Path, suffixes: tuple[str, ...], degree: int) -> dict[str, File]:
-        count = len(run.backbone.table)
-        return {".ply": File(200 * count, 0.0), ".spz": File(20 * count, lost), ".sog": File(40 * count, 1.0)}
-
-    monkeypatch.setattr(compacting, "written", sizes)
-    found = compacting.for_smallest_file(run, shrinking, tries[0])
-    assert found.removed == taken
-    assert len(run.backbone.table) == pytest.approx((1 - taken) * rows, abs=1)
-
-
-def test_a_file_that_loses_more_than_it_was_expected_to_is_not_taken(
-    shrinking: Shrinking, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = shrinking.run
-    rows = len(run.backbone.table)
-    shrinking.options = replace(shrinking.options, max_drop=0.1)
-    best = replace(shrinking.untouched, removed=0.5, megabytes=0.5 * shrinking.untouched.megabytes, drop=0.09)
-    shrinking.tried.append(best)
-    shrinking.take(best)
-
-    def sizes(run: Run, shrinking: Shrinking, to: Path, suffixes: tuple[str, ...], degree: int) -> dict[str, File]:
-        count = len(run.backbone.table)
-        return {".ply": File(200 * count, 0.0), ".spz": File(20 * count, 0.05 if count < rows else 0.3)}
-
-    monkeypatch.setattr(compacting, "written", sizes)
-    assert compacting.for_smallest_file(run, shrinking, best) == best
-    assert len(run.backbone.table) == rows // 2
+    monkeypatch.setattr(importance, "DRAWS", 6)
+    monkeypatch.setattr(shrink, "least_file_loss", lambda *args: lost)
+    options = ShrinkOptions(max_drop=0.1, steps=0, zooms=(1.0,))
+    assert Search(opened(folder), options, plugins(), generator()).reserve == reserve
 
 
 @pytest.mark.parametrize(("found", "told"), [(30.0, 29.994), (math.inf, 58.923), (58.923, 55.912)])
@@ -338,8 +303,8 @@ def test_a_run_folder_comes_out(folder: Path, tmp_path: Path) -> None:
         assert facts["drop"] <= 0.5 or not facts["kept"] or suffix == ".ply"
     columns = read_ply(to / "point_cloud.ply")
     assert len(columns["x"]) == len(small.backbone.table)
-    learnt = figures(small, judges(big)[1], [1.0])["1"]
-    assert learnt == pytest.approx(figures(big, judges(big)[1], [1.0])["1"], abs=1.0)
+    learnt = zoomed_psnr(small, split_views(big)[1], [1.0])["1"]
+    assert learnt == pytest.approx(zoomed_psnr(big, split_views(big)[1], [1.0])["1"], abs=1.0)
 
 
 @pytest.mark.usefixtures("few_tries")
@@ -378,10 +343,10 @@ def test_what_cannot_be_made_smaller_is_told_and_leaves_nothing(folder: Path, tm
 
 
 def test_an_error_leaves_no_folder(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*given: object) -> Shrinking:
+    def fail(*given: object) -> Search:
         raise MemoryError
 
-    monkeypatch.setattr(compacting, "Shrinking", fail)
+    monkeypatch.setattr(compacting, "Search", fail)
     with pytest.raises(MemoryError):
         compact(folder, tmp_path / "small", 0.1, 1, [], plugins())
     assert not (tmp_path / "small").exists()
@@ -390,9 +355,9 @@ def test_an_error_leaves_no_folder(folder: Path, tmp_path: Path, monkeypatch: py
 def test_masked_pixels_make_no_row_worth_anything(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importance, "DRAWS", 6)
     run = opened(folder)
-    assert float(worth_of(run, run.scene.train, generator()).max()) > 0
+    assert float(importance_of(run, run.scene.train, generator()).max()) > 0
     monkeypatch.setattr(View, "counted", lambda view: torch.zeros(36, 48, dtype=torch.bool))
-    assert float(worth_of(run, run.scene.train, generator()).max()) == 0
+    assert float(importance_of(run, run.scene.train, generator()).max()) == 0
 
 
 @pytest.mark.usefixtures("few_tries")

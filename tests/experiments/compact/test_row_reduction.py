@@ -110,8 +110,8 @@ def test_a_larger_share_goes_on_where_a_smaller_one_ended() -> None:
     assert torch.equal(again.table["means"], small.table["means"])
     lost = sum(float(worth[row]) for row, into in zip(first.gone, first.into, strict=True) if into < 0)
     one_round = reduction_of(model_of(16), worth)
-    one_round.find()
-    assert float(one_round.worth.sum()) == pytest.approx(float(worth.sum()) - lost, rel=1e-5)
+    one_round.add_round()
+    assert float(one_round.importance.sum()) == pytest.approx(float(worth.sum()) - lost, rel=1e-5)
 
 
 def test_levels_are_not_merged() -> None:
@@ -153,10 +153,10 @@ def test_the_order_is_that_of_the_beginning() -> None:
     """Though the model has learnt on since."""
     model = model_of(12)
     still, moving = (reduction_of(model, spread(12, 5)[:, 0].abs()) for _ in range(2))
-    still.find()
+    still.add_round()
     with torch.no_grad():
         model.table["means"].add_(spread(12, 6))
-    moving.find()
+    moving.add_round()
     assert torch.equal(still.rounds[0].gone, moving.rounds[0].gone)
     assert torch.equal(still.rounds[0].into, moving.rounds[0].into)
     assert all(torch.equal(value, moving.rows[name]) for name, value in still.rows.items())

@@ -206,7 +206,7 @@ def test_the_viewer_saves_and_shows_coordinates_of_the_scene(far: tuple[Run, Set
 
     run, _ = far
     viewer, screen = MagicMock(), Screen(lambda image: None)
-    viewer.frames.model, viewer.folder, viewer.keyframes, viewer.told = RunModel(run), tmp_path, [], "now"
+    viewer.frames.model, viewer.folder, viewer.keyframes, viewer.status = RunModel(run), tmp_path, [], "now"
     panel, pose = Panel(viewer, MagicMock(), screen), pose_of(run.scene.test[0], 64)
     panel.moved(SimpleNamespace(position=pose.position, wxyz=pose.wxyz, fov=pose.fov, image_width=64, image_height=48))
     panel.add_keyframe()

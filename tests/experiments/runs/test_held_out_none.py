@@ -15,8 +15,8 @@ import gsx.api
 from gsx.builtin import plugins
 from gsx.cli.runs import evaluate_file
 from gsx.core.errors import ConfigError, InputError
-from gsx.experiments.compact.compact import tell
-from gsx.experiments.compact.shrink import judges
+from gsx.experiments.compact.compact import log_result
+from gsx.experiments.compact.fine_tuning import split_views
 from gsx.experiments.evaluation.remarks import NOT_MEASURED
 from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.files import LOG, read_run, state_of
@@ -103,12 +103,11 @@ def test_files_are_compared_in_training_views(folder: Path, tmp_path: Path) -> N
 
 def test_a_smaller_model_is_judged_by_training_views(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     run, _ = open_run(folder, plugins())
-    learnt, judging = judges(run)
-    assert (len(learnt), len(judging)) == (2, 2)
+    assert [len(views) for views in split_views(run)] == [2, 2]
     found = {"before": {"primitives": 120}, "chosen": {"drop": 0.05}, "formats": {}, "max_drop_db": 0.1}
     with caplog.at_level("INFO", "gsx.experiments.compact.compact"):
-        tell(folder, evaluation_of(folder), found)
-    assert caplog.messages[-1] == "promised 0.1 dB, 0.05 lost in training views that judge"
+        log_result(folder, evaluation_of(folder), found)
+    assert caplog.messages[-1] == "drop 0.05 dB <= 0.1 dB on validation views"
 
 
 def test_a_table_says_why_there_is_no_figure(folder: Path) -> None:

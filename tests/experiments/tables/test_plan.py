@@ -299,4 +299,4 @@ def test_a_launcher_that_gives_up_does_not_cost_the_table(tmp_path: Path, caplog
     text, code = run_table([words[0], words[1], f"output='{tmp_path}/a (1)'", words[3]], plugins(), job)
     assert code == 2
     assert "not run yet" in text
-    assert "gave up (RuntimeError: a process was killed)" in caplog.text
+    assert "the launcher failed (RuntimeError: a process was killed)" in caplog.text

@@ -263,7 +263,7 @@ def test_paused_training_does_not_wait_for_a_browser_that_was_closed(
         viewer.left(client)
         shown.gsx_step_finished(run, None)  # type: ignore[arg-type]
         assert not viewer.paused
-        assert "it goes on" in caplog.text
+        assert "training continues" in caplog.text
     finally:
         shown.stop()
 

@@ -1,9 +1,8 @@
-"""In what order the rows of a model go: what pictures need least first, by itself or merged with a neighbour.
+"""The order in which rows of a model go: the least important first, removed or merged with a neighbour.
 
-Pictures lose what a row is worth where it goes. Where two become one they lose that share of what both are worth by
-which the field of both changes (`backbones.merging`): little where they lie on each other and agree in colour,
-however much they are worth. Rows take part once in a round, of which none takes more than a quarter of what is left.
-A 3D filter is part of what is drawn: rows are merged with it, and it is taken off what they become.
+Removing a row costs its importance. Merging two costs the share of the importance of both by which their field changes
+(`backbones.merging`): little where they overlap and agree in colour. A row takes part once in a round; no round takes
+more than a quarter of the rows. Rows are merged as their 3D filter draws them; it is taken off the merged row.
 """
 
 import math
@@ -28,16 +27,16 @@ from gsx.core.training.parameter_table import (
 ROUND = 0.25
 """Share of the rows that go in one round."""
 NEIGHBOURS = 10
-"""Nearest rows that each may be merged with."""
+"""Nearest rows that each row may be merged with."""
 AT_ONCE = 1 << 16
-"""Pairs looked at at a time."""
+"""Pairs whose cost is computed at once."""
 ORDERLESS = ("log_scales", "quats")
-"""Parameters whose entries are along other axes once rows are merged."""
+"""Parameters whose entries are along other axes after merging."""
 
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """Rows that go, in order, by their numbers before the round."""
+    """Rows that go, in order, by their indices before the round."""
 
     gone: Int[Tensor, "K"]
     into: Int[Tensor, "K"]
@@ -45,46 +44,47 @@ class Round:
 
 
 class Reduction:
-    """The order in which rows go, found as far as it is asked for."""
+    """The order in which rows go, computed round by round."""
 
-    def __init__(self, table: ParameterTable, worth: Float[Tensor, "N"], colours: Float[Tensor, "N 3"] | None) -> None:
-        """`worth`: what pictures lose without each row; `colours`: as they see them, where rows can be merged."""
+    def __init__(
+        self, table: ParameterTable, importance: Float[Tensor, "N"], colours: Float[Tensor, "N 3"] | None
+    ) -> None:
+        """`importance`: loss of pictures without each row; `colours`: mean over views, None: rows are not merged."""
         rows = detached_rows(table)
-        able = colours is not None and all(name in rows for name in PARAMETERS)
         self.rows: dict[str, Tensor] = {}
-        if able and colours is not None:
+        """Rows as they are drawn; empty: they cannot be merged."""
+        if colours is not None and all(name in rows for name in PARAMETERS):
             drawn = with_filter(rows, smoothed_raw)
             needed = (name for name, value in drawn.items() if name in PARAMETERS or not value.is_floating_point())
             self.rows = {name: drawn[name].clone() for name in needed} | {"colours": colours}
-        self.worth, self.count = worth, len(worth)
+        self.importance, self.count = importance, len(importance)
         self.rounds: list[Round] = []
 
     def apply(self, table: ParameterTable, share: float) -> None:
-        """Take a share of the rows off the table, whose rows are still all those of the beginning; one stays."""
+        """Takes a share of the rows off a table that has all of them; at least one row stays."""
         left = min(self.count - 1, round(share * self.count))
         number = 0
         while left > 0:
             if number == len(self.rounds):
-                self.find()
-            taken = self.rounds[number]
-            reduce_table(table, taken.gone[:left], taken.into[:left])
-            left, number = left - len(taken.gone), number + 1
+                self.add_round()
+            gone, into = self.rounds[number].gone, self.rounds[number].into
+            reduce_table(table, gone[:left], into[:left])
+            left, number = left - len(gone), number + 1
 
-    def find(self) -> None:
-        """The next round, and what is left after it."""
-        found = next_round(self.rows, self.worth)
-        self.rounds.append(found)
-        kept, pairs = survivors(len(self.worth), found.gone, found.into), found.into >= 0
-        first, second = found.gone[pairs], found.into[pairs]
+    def add_round(self) -> None:
+        """Computes the next round, and the rows that are left after it."""
+        new_round = next_round(self.rows, self.importance)
+        self.rounds.append(new_round)
+        kept, pairs = survivors(len(self.importance), new_round.gone, new_round.into), new_round.into >= 0
+        first, second = new_round.gone[pairs], new_round.into[pairs]
         if self.rows:
             new = merged(self.rows, first, second)
             self.rows = {name: torch.cat([value[kept], new[name]]) for name, value in self.rows.items()}
-        self.worth = torch.cat([self.worth[kept], self.worth[first] + self.worth[second]])
+        self.importance = torch.cat([self.importance[kept], self.importance[first] + self.importance[second]])
 
 
 def with_filter(rows: Rows, change: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
-    """Rows whose scales and opacities a change by their 3D filter has made others, where there is one: put on them
-    (`smoothed_raw`), or taken off as far as it can be (`unsmoothed`)."""
+    """Puts the 3D filter of rows, if any, on scales and opacities (`smoothed_raw`) or takes it off (`unsmoothed`)."""
     if "filter" not in rows:
         return dict(rows)
     names = ("log_scales", "opacity_logits")
@@ -93,7 +93,7 @@ def with_filter(rows: Rows, change: Callable[[Tensor, Tensor, Tensor], tuple[Ten
 
 
 def survivors(count: int, gone: Int[Tensor, "K"], into: Int[Tensor, "K"]) -> Bool[Tensor, "N"]:
-    """Rows that have no part in it."""
+    """Marks rows that neither go nor are merged."""
     kept = torch.ones(count, dtype=torch.bool, device=gone.device)
     kept[gone] = False
     kept[into[into >= 0]] = False
@@ -101,8 +101,10 @@ def survivors(count: int, gone: Int[Tensor, "K"], into: Int[Tensor, "K"]) -> Boo
 
 
 def reduce_table(table: ParameterTable, gone: Int[Tensor, "K"], into: Int[Tensor, "K"]) -> None:
-    """Take rows off a table; merged ones come last. These learn on as what they were, so that they begin with the
-    second moments of both; as zeros they would let the first steps be far too long."""
+    """Takes rows off a table; merged ones come last.
+
+    They begin with the second moments of both: zeros would make their first steps far too long.
+    """
     pairs = into >= 0
     first, second = gone[pairs], into[pairs]
     new: dict[str, Tensor] = {}
@@ -121,22 +123,22 @@ def reduce_table(table: ParameterTable, gone: Int[Tensor, "K"], into: Int[Tensor
 # -- a round -----------------------------------------------------------------------------------------------------------
 
 
-def next_round(rows: Rows, worth: Float[Tensor, "N"]) -> Round:
-    """What goes next, the cheapest first. rows: empty where none can be merged."""
-    wanted = math.ceil(ROUND * len(worth))
-    first, second = pairs_of(rows) if rows and len(worth) > 1 else (worth.new_empty(0).long(),) * 2
-    costs = torch.cat([worth.double(), merging_costs(rows, worth, first, second)])
-    gone, into = cheapest(costs, first, second, len(worth), wanted)
-    return Round(torch.tensor(gone, device=worth.device), torch.tensor(into, device=worth.device))
+def next_round(rows: Rows, importance: Float[Tensor, "N"]) -> Round:
+    """Computes what goes next, the cheapest first; `rows`: empty where none can be merged."""
+    count = len(importance)
+    first, second = pairs_of(rows) if rows and count > 1 else (importance.new_empty(0).long(),) * 2
+    costs = torch.cat([importance.double(), merging_costs(rows, importance, first, second)])
+    gone, into = cheapest(costs, first, second, count, math.ceil(ROUND * count))
+    return Round(torch.tensor(gone, device=importance.device), torch.tensor(into, device=importance.device))
 
 
 def pairs_of(rows: Rows) -> tuple[Int[Tensor, "P"], Int[Tensor, "P"]]:
-    """Rows that may be merged: neighbours that are alike in all whole numbers, as levels are; each pair once."""
+    """Lists pairs that may be merged: neighbours with the same whole numbers, such as levels; each pair once."""
     count = len(rows["means"])
     _, others = nearest(rows["means"], min(NEIGHBOURS, count - 1))
-    own = torch.arange(count, device=others.device)[:, None].expand_as(others)
-    number = torch.unique(torch.minimum(own, others) * count + torch.maximum(own, others))
-    first, second = number // count, number % count
+    rows_of = torch.arange(count, device=others.device)[:, None].expand_as(others)
+    pairs = torch.unique(torch.minimum(rows_of, others) * count + torch.maximum(rows_of, others))
+    first, second = pairs // count, pairs % count
     for value in rows.values():
         if not value.is_floating_point():
             alike = value[first] == value[second]
@@ -145,26 +147,26 @@ def pairs_of(rows: Rows) -> tuple[Int[Tensor, "P"], Int[Tensor, "P"]]:
 
 
 def merging_costs(
-    rows: Rows, worth: Float[Tensor, "N"], first: Int[Tensor, "P"], second: Int[Tensor, "P"]
+    rows: Rows, importance: Float[Tensor, "N"], first: Int[Tensor, "P"], second: Int[Tensor, "P"]
 ) -> Float[Tensor, "P"]:
-    """What pictures lose where two become one; infinite where that cannot be told."""
+    """Estimates what pictures lose where two rows become one; infinite where that is not a number."""
     if not len(first):
-        return worth.new_empty(0).double()
+        return importance.new_empty(0).double()
     all_of = densities(rows, rows["colours"])
     parts = []
     for a, b in zip(first.split(AT_ONCE), second.split(AT_ONCE), strict=True):
         whole = merged(rows, a, b)
         change = changes(all_of.at(a), all_of.at(b), densities(whole, whole["colours"]))
-        parts.append(change * (worth[a] + worth[b]).double())
+        parts.append(change * (importance[a] + importance[b]).double())
     return torch.cat(parts).nan_to_num(nan=math.inf)
 
 
 def cheapest(
-    costs: Float[Tensor, "C"], first: Int[Tensor, "P"], second: Int[Tensor, "P"], count: int, wanted: int
+    costs: Float[Tensor, "C"], first: Int[Tensor, "P"], second: Int[Tensor, "P"], count: int, most: int
 ) -> tuple[list[int], list[int]]:
-    """(rows that go, those they are merged with or -1) of the cheapest ways, each row taking part once.
+    """Picks the `most` cheapest ways, each row taking part once; returns (rows that go, rows they merge with or -1).
 
-    costs: of `count` rows going, then of P pairs merging.
+    `costs`: of removing each of `count` rows, then of merging P pairs.
     """
     one, other = first.tolist(), second.tolist()
     busy, gone, into = [False] * count, list[int](), list[int]()
@@ -177,6 +179,6 @@ def cheapest(
             busy[partner] = True
         gone.append(row)
         into.append(partner)
-        if len(gone) == wanted:
+        if len(gone) == most:
             break
     return gone, into

@@ -17,7 +17,7 @@ from gsx.experiments.runs.rasterizer_path import compile_beside
 from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.viewer.pictures import FileModel, RunModel
 from gsx.experiments.viewer.server import Viewer
-from gsx.experiments.viewer.training import told_of
+from gsx.experiments.viewer.training import status_of
 from gsx.formats.splat_files import read_around
 
 EVERY = 2.0
@@ -55,7 +55,7 @@ class Watched:
 
     def state(self) -> str:
         """Returns the state of the run in words."""
-        return f"{told_of(self.run)}, {state_of(read_run(self.run.folder))[0]}"
+        return f"{status_of(self.run)}, {state_of(read_run(self.run.folder))[0]}"
 
 
 def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Callable[[str], None]) -> None:
@@ -66,7 +66,7 @@ def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Cal
     """
     watched = Watched(folder, plugins)
     viewer = Viewer(RunModel(watched.run), f"{watched.run.scene.name}, {folder.name}", host, port)
-    viewer.tell(watched.state())
+    viewer.show_status(watched.state())
     announce(viewer.address)
     try:
         viewer.serve(lambda: False, lambda: viewer.changed(watched.state()) if watched.refresh() else None)
@@ -82,7 +82,7 @@ def view_file(path: Path, axes: str, host: str, port: int, announce: Callable[[s
         raise InputError(f"{path} holds no splats: choose another file")
     raster = rules_of(path)
     viewer = Viewer(FileModel(gaussians, raster, origin), path.name, host, port)
-    viewer.tell(f"{len(gaussians.means):,} splats{', opacities compensated' if raster.compensate else ''}")
+    viewer.show_status(f"{len(gaussians.means):,} splats{', opacities compensated' if raster.compensate else ''}")
     announce(viewer.address)
     try:
         viewer.serve(lambda: False)

@@ -1,4 +1,4 @@
-"""What the datasets of the paper consist of, what of them is on this machine, and where the rest is to be had."""
+"""The datasets of the paper: what they consist of, what is on this machine, and where the rest can be had."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,7 +8,7 @@ from gsx.core.files import at_home, file_count
 
 
 def missing(dataset: dict[str, Any], scene: str, root: Path) -> str:
-    """What keeps a scene from being trained; empty if it is all there."""
+    """Returns why a scene cannot be trained; empty if its files are complete."""
     folder = at_home(root) / dataset["folder"] / scene if dataset["folder"] else None  # else it is built in
     if folder is None:
         return ""
@@ -24,7 +24,7 @@ def missing(dataset: dict[str, Any], scene: str, root: Path) -> str:
 
 
 def described(dataset: dict[str, Any], root: Path) -> Iterator[str]:
-    """A dataset in lines: what is expected, what is found, what is missing and where it is to be had."""
+    """Describes a dataset in lines: what is expected, found and missing, and where it can be had."""
     scenes = list(dataset["scenes"])
     lacking = {scene: reason for scene in scenes if (reason := missing(dataset, scene, root))}
     found = [scene for scene in scenes if scene not in lacking]

@@ -1,4 +1,4 @@
-"""From a table to runs: which there are, which are done, and which have a beginning in common.
+"""Plans the runs of a table: all runs, those that are done, and those with a common beginning.
 
 Runs of one scene, backbone and seed that differ in their augmenters alone are identical until the first of them makes
 pseudo views. One of each such group, the one that goes on longest without (the run without any, where there is one), is
@@ -35,16 +35,16 @@ class Experiment:
     rows: dict[str, str]
     """By row a variant's name, or overrides with spaces between them."""
     quoted: dict[str, str] = field(default_factory=dict)
-    """Rows that are not run, and why."""
+    """Reasons of rows that are not run."""
     overrides: list[str] = field(default_factory=list)
     """Of every run."""
     seeds: Annotated[list[int], Range(0, LARGEST_SEED)] = field(default_factory=lambda: [0])
     only: list[str] = field(default_factory=list)
-    """Rows that are run; none given: all."""
+    """Rows that are run; empty: all."""
     scenes: list[str] = field(default_factory=list)
-    """Scenes that are run; none given: all of the datasets."""
+    """Scenes that are run; empty: all of the datasets."""
     dry: bool = False
-    """Say what would be run, and run nothing."""
+    """Print the commands, and run nothing."""
 
     def __post_init__(self) -> None:
         for row in self.only:
@@ -54,7 +54,7 @@ class Experiment:
             raise ValueError(f"experiment.seeds is {list(self.seeds)}; give different ones, for example [0,1,2]")
 
     def refuse_unless(self, key: str, row: str, known: Sequence[str]) -> None:
-        """Raise ValueError for a key's row unless it is one of these."""
+        """Raises ValueError for a key's row unless it is one of these."""
         if row not in known:
             raise ValueError(
                 f"experiment.{key}: '{row}' is no row of {self.name}; it has {', '.join(known)}.{nearest(row, known)}"
@@ -62,12 +62,12 @@ class Experiment:
 
     @property
     def chosen(self) -> dict[str, str]:
-        """What each row is that is run."""
+        """Returns variant or overrides of each row that is run."""
         return {row: variant for row, variant in self.rows.items() if not self.only or row in self.only}
 
 
 def words_of(row: str) -> list[str]:
-    """The overrides that a row of `Experiment.rows` stands for."""
+    """Returns the overrides that a row of `Experiment.rows` stands for."""
     return row.split() if "=" in row else [f"variant={row}"]
 
 
@@ -83,39 +83,39 @@ class Cell:
     overrides: list[str]
     settings: Settings
     stamp: str
-    """Of its scene, when the table was planned."""
+    """Stamp of its scene when the table was planned."""
 
     @property
     def config(self) -> dict[str, Any]:
-        """The resolved composition."""
+        """Returns the resolved composition."""
         return self.settings.resolved
 
     @property
     def folder(self) -> Path:
-        """Where its run lies; other cells with the same composition share it."""
+        """Returns the run folder; other cells with the same composition share it."""
         return place_of(self.config, self.stamp, self.settings.idle)
 
     @property
     def finished(self) -> bool:
-        """Whether its run is done."""
+        """Returns whether its run is done."""
         return finished(read_run(self.folder), self.config, self.stamp, self.settings.idle)
 
     @property
     def begins(self) -> int:
-        """Steps in common with a run without augmenters; 0 where an augmenter does not foretell it."""
+        """Counts the steps in common with a run without augmenters; 0 where an augmenter does not foretell it."""
         iterations, options = self.settings.general.iterations, [a.options for a in self.settings.augmenters.values()]
-        told = [option.begins(iterations) if isinstance(option, Foretold) else 0 for option in options]
-        return min([iterations, *told])
+        begins = [option.begins(iterations) if isinstance(option, Foretold) else 0 for option in options]
+        return min([iterations, *begins])
 
     @property
     def beginning(self) -> str:
-        """What runs share that can branch from each other."""
+        """Returns a key that runs share which can branch from each other."""
         return content_key(sorted_items(trained(without_augmenters(self.config), self.settings.idle)), self.stamp)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plan:
-    """What is to be done."""
+    """The runs of a table and their order."""
 
     experiment: Experiment
     datasets: dict[str, Any]
@@ -137,8 +137,9 @@ def cells_of(
     words: Callable[[str], Sequence[str]],
     compose: Callable[[list[str]], Settings],
 ) -> Iterator[Cell]:
-    """Every run of a table, in its order: scene by scene, row by row, seed by seed. `words`: of the command
-    line, by what a row is.
+    """Yields every run of a table, in its order: scene by scene, row by row, seed by seed.
+
+    `words`: returns the overrides of the command line that fit a row.
 
     Raises:
         ConfigError: a composition is wrong.
@@ -167,7 +168,7 @@ def cells_of(
 
 
 def planned(experiment: Experiment, datasets: dict[str, Any], cells: Sequence[Cell], together: bool = False) -> Plan:
-    """What of the cells is to be run, and in which order; `together`: by a launcher that runs several at once.
+    """Plans which cells are run, in which order; `together`: by a launcher that runs several at once.
 
     One after the other each group is run as a whole, so that few states need be kept at a time.
     """
@@ -197,7 +198,7 @@ def planned(experiment: Experiment, datasets: dict[str, Any], cells: Sequence[Ce
 
 
 def with_states(cell: Cell, others: Sequence[Cell]) -> list[str]:
-    """A run's overrides, so that it leaves its state where others set out."""
+    """Returns a run's overrides, so that it leaves its state where others branch off."""
     steps = sorted({other.begins for other in others if 0 < other.begins < other.settings.general.iterations})
     if not steps:
         return [*cell.overrides, "init=scratch"]
@@ -205,7 +206,7 @@ def with_states(cell: Cell, others: Sequence[Cell]) -> list[str]:
 
 
 def plan_lines(plan: Plan) -> list[str]:
-    """The plan in words."""
+    """Describes the plan in lines."""
     runs = sum(map(len, plan.phases))
     rows, seeds = len(plan.experiment.chosen), len(plan.experiment.seeds)
     scenes = len({(cell.dataset, cell.scene) for cell in plan.cells})
@@ -219,7 +220,7 @@ def plan_lines(plan: Plan) -> list[str]:
 
 
 def check_scenes(experiment: Experiment, datasets: dict[str, Any]) -> None:
-    """Raise ConfigError for scenes that no dataset has."""
+    """Raises ConfigError for scenes that no dataset has."""
     known = [scene for dataset in datasets.values() for scene in dataset["scenes"]]
     for scene in experiment.scenes:
         if scene not in known:

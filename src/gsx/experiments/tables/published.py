@@ -19,7 +19,7 @@ class Published:
     figures: dict[tuple[str, str, str], float]
     """By method, scope (dataset, scene, or group of views) and metric; corrected where the paper corrects itself."""
     notes: list[str]
-    """What was corrected."""
+    """Corrections."""
 
     @property
     def methods(self) -> list[str]:
@@ -39,13 +39,13 @@ class Published:
 
 
 def tables() -> list[str]:
-    """Names of the tables there are."""
+    """Lists the names of the tables."""
     files = (resources.files("gsx.conf") / "published").iterdir()
     return sorted(file.name.removesuffix(".csv") for file in files if file.name != "errata.csv")
 
 
 def read_table(name: str) -> Published:
-    """A table of the paper.
+    """Reads a table of the paper.
 
     Raises:
         ConfigError: there is none of that name.
@@ -71,6 +71,6 @@ def read_table(name: str) -> Published:
 
 
 def lines_of(name: str) -> list[dict[str, str]]:
-    """Lines of a file of conf/published."""
+    """Reads the lines of a file of conf/published."""
     text = (resources.files("gsx.conf") / "published" / f"{name}.csv").read_text(encoding="utf-8")
     return list(csv.DictReader(io.StringIO(text)))

@@ -1,4 +1,4 @@
-"""A table from its command line to its files: plan, run what is missing, gather, write."""
+"""A table from its command line to its files: plans it, runs what is missing, gathers and writes."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -38,23 +38,23 @@ TAKEN = {
     "warm_start_at": "leave it out",
     "folder": "output=FOLDER",
 }
-"""Keys that are set for each run, and what to say instead."""
+"""Remedies by key that a table sets for each run."""
 OWN = ("experiment", "dataset", "hydra")
-"""Keys of the command line that are not handed on to every run as they are."""
+"""Keys of the command line that are not passed to every run as they are."""
 
 
 def is_below_dataset(word: str) -> bool:
-    """Whether an override changes something of the dataset instead of choosing one."""
+    """Returns whether an override changes something of the dataset instead of choosing one."""
     return word.lstrip("+~").startswith("dataset.")
 
 
 def is_table(overrides: Sequence[str]) -> bool:
-    """Whether a command line asks for a table."""
+    """Returns whether a command line names a table."""
     return any(word.lstrip("+").startswith("experiment=") for word in overrides)
 
 
 def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], Any]) -> tuple[str, int]:
-    """Run what is missing of a table; returns its text and the exit code: 2 if figures are missing.
+    """Runs what is missing of a table; returns its text and the exit code: 2 if figures are missing.
 
     `job` carries out one composition.
 
@@ -80,7 +80,7 @@ def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], A
         due = [cell for cell in cells if (cell.dataset, cell.scene) not in lacking]
         plan = planned(experiment, datasets, due, together=any("launcher=" in word for word in launching))
         folder = folder_of(plan, plain, cells[0].config, common)
-        tell(plan, lacking)
+        log_plan(plan, lacking)
         if experiment.dry:
             return "".join(f"{command(*job)}\n" for phase in plan.phases for job in phase), 0
         refuse_absent_slurm(launching)
@@ -93,7 +93,7 @@ def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], A
 
 
 def tidy(folder: Path, cells: Sequence[Cell]) -> None:
-    """Finish what killed processes left of runs that are not started again, and of the table's own folder."""
+    """Finishes what killed processes left of runs that are not started again, and of the table's folder."""
     if folder.is_dir():
         remove_partial(folder)
     for run in dict.fromkeys(cell.folder for cell in cells if cell.finished):
@@ -109,19 +109,19 @@ def launched(
     jobs: Sequence[Sequence[str]],
     job: Callable[[Any], Any],
 ) -> None:
-    """Carry out a phase. A launcher that gives up, for one killed process perhaps, does not cost the table."""
+    """Runs a phase. A launcher that fails, for one killed process perhaps, does not end the table."""
     try:
         launch_jobs(overrides, folder, jobs, job)
     except Exception as error:
         logger.warning(
-            "the launcher gave up (%s: %s): give the same command again for what is missing",
+            "the launcher failed (%s: %s): give the same command again for the missing runs",
             type(error).__name__,
             first_line(error),
         )
 
 
 def experiment_of(overrides: Sequence[str], compositions: Compositions) -> Experiment:
-    """The table that these overrides choose and change."""
+    """Composes the table that these overrides choose and change."""
     experiment: Experiment = typed(Experiment, compositions.node(overrides, "experiment"), "experiment")
     return experiment
 
@@ -129,7 +129,7 @@ def experiment_of(overrides: Sequence[str], compositions: Compositions) -> Exper
 def fitting_words(
     experiment: Experiment, datasets: Sequence[str], overrides: Sequence[str], compositions: Compositions
 ) -> dict[str, list[str]]:
-    """The overrides for each row, by what it is: those of a component (PARTS) only where it has such a key.
+    """Returns the overrides for each row: those of a component (PARTS) only where the row has such a key.
 
     Raises:
         ConfigError: no row has it.
@@ -150,7 +150,7 @@ def fitting_words(
 
 
 def refuse_taken(overrides: Sequence[str]) -> None:
-    """Raise ConfigError for overrides that each run of a table has of its own."""
+    """Raises ConfigError for overrides that a table sets for each run."""
     for word in overrides:
         key = word.lstrip("+~").partition("=")[0]
         if key in TAKEN or word.startswith("~dataset"):
@@ -159,7 +159,7 @@ def refuse_taken(overrides: Sequence[str]) -> None:
 
 
 def refuse_sweeps(overrides: Sequence[str]) -> None:
-    """Raise ConfigError for overrides that ask for several values: a table has rows, scenes and seeds for that."""
+    """Raises ConfigError for overrides with several values: a table has rows, scenes and seeds for that."""
     for override in parse_overrides(overrides):
         if override.is_sweep_override():
             remedy = "experiment.seeds=[0,1,2]" if override.key_or_group == "seed" else "another table"
@@ -167,15 +167,15 @@ def refuse_sweeps(overrides: Sequence[str]) -> None:
 
 
 def datasets_of(experiment: Experiment, overrides: Sequence[str], compositions: Compositions) -> dict[str, Any]:
-    """The datasets of a table as composed, by name: that of the command line, or the paper's."""
-    asked = [word.partition("=")[2] for word in overrides if word.startswith("dataset=")]
+    """Composes the datasets of a table by name: that of the command line, or the paper's."""
+    chosen = [word.partition("=")[2] for word in overrides if word.startswith("dataset=")]
     below = [word for word in overrides if is_below_dataset(word)]
-    names = asked[-1:] or experiment.datasets
+    names = chosen[-1:] or experiment.datasets
     return {name: compositions.node([f"dataset={name}", *below], "dataset") for name in names}
 
 
 def protocol_of(experiment: Experiment, cells: Sequence[Cell], compositions: Compositions) -> list[str]:
-    """In what the rows differ from the paper's, by one scene of each; those that it has not are named."""
+    """Lists how the rows differ from the paper's, by one scene of each; names rows that the paper does not have."""
     home, by_row = experiment.datasets[0], {cell.row: cell for cell in reversed(cells)}
     added = [f"{row} is no row of its table" for row in by_row if row not in experiment.rows]
     of_rows = [cell for row, cell in by_row.items() if row in experiment.rows]
@@ -189,23 +189,23 @@ def protocol_of(experiment: Experiment, cells: Sequence[Cell], compositions: Com
 
 
 def lacking_of(cells: Sequence[Cell], datasets: dict[str, Any]) -> dict[tuple[str, str], str]:
-    """Why scenes cannot be trained, by dataset and scene."""
+    """Returns reasons why scenes cannot be trained, by dataset and scene."""
     places = {(cell.dataset, cell.scene): Path(cell.settings.general.data_root) for cell in cells}
     reasons = {(name, scene): missing(datasets[name], scene, root) for (name, scene), root in places.items()}
     return {place: reason for place, reason in reasons.items() if reason}
 
 
 def folder_of(plan: Plan, plain: Experiment, config: dict[str, Any], common: Sequence[str]) -> Path:
-    """Where a table is written: with other overrides than the published ones it is another folder."""
-    told = [plan.experiment.name, *plan.datasets, config["budget"]["name"]]
+    """Returns the folder of a table; other overrides than the published ones make another folder."""
+    names = [plan.experiment.name, *plan.datasets, config["budget"]["name"]]
     others = [word for word in common if key_of(word) not in ("budget", "output", "data_root")]
     changed = others or plan.experiment != plain
     key = [content_key(others, sorted_items(vars(plan.experiment)))[:6]] if changed else []
-    return Path(config["output"]) / "experiments" / "_".join([*told, *key])
+    return Path(config["output"]) / "experiments" / "_".join([*names, *key])
 
 
-def tell(plan: Plan, lacking: dict[tuple[str, str], str]) -> None:
-    """Say what is about to happen."""
+def log_plan(plan: Plan, lacking: dict[tuple[str, str], str]) -> None:
+    """Logs what is run, and which scenes are missing."""
     for line in plan_lines(plan):
         logger.info("%s", line)
     for reason in dict.fromkeys(lacking.values()):
@@ -213,7 +213,7 @@ def tell(plan: Plan, lacking: dict[tuple[str, str], str]) -> None:
 
 
 def write_table(table: Table, folder: Path, runs: Sequence[Path]) -> None:
-    """table.csv, table.md and table.tex, and the report over the runs."""
+    """Writes table.csv, table.md, table.tex and the overview of the runs."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in (("table.csv", as_csv(table)), ("table.md", as_markdown(table)), ("table.tex", as_latex(table))):
         replace_text(folder / name, text)

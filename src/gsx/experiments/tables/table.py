@@ -1,4 +1,4 @@
-"""Figures of a table from the folders of its runs, beside those of the paper."""
+"""Figures of a table from the folders of its runs, compared with those of the paper."""
 
 import statistics
 from collections.abc import Callable, Iterator, Sequence
@@ -48,13 +48,13 @@ SHOWN_KEYS = 12
 
 
 def thousandth(value: Any) -> float | None:
-    """A number in thousands."""
+    """Divides a number by a thousand."""
     return value / 1000 if is_number(value) else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scope:
-    """What a figure is a mean over: the scenes of a dataset, one of them, or a group of views in all of them."""
+    """Runs that a figure is a mean over: the scenes of a dataset, one of them, or a group of views in all."""
 
     title: str
     """As in the paper's table."""
@@ -62,7 +62,7 @@ class Scope:
     scenes: list[str]
     group: str = ""
     paper: str = ""
-    """Scope of the paper's figures beside it; empty: there are none."""
+    """Scope of the paper's figures to compare with; empty: there are none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,13 +89,13 @@ class Figure:
     problem: str = ""
     """Why there is no figure."""
     remarks: tuple[str, ...] = ()
-    """What a reader must know of the runs behind it."""
+    """Remarks on its runs."""
     by_seed: tuple[float, ...] = ()
     """Means over the scenes, seed by seed."""
 
     @property
     def scenes(self) -> int:
-        """How many scenes the figure is a mean over."""
+        """Counts the scenes that the figure is a mean over."""
         return len(self.whole)
 
 
@@ -108,7 +108,7 @@ class Table:
     scopes: list[Scope]
     metrics: list[str]
     foreign: list[str]
-    """In what it differs from the paper's protocol; empty: in nothing."""
+    """Differences from the paper's protocol."""
     notes: list[str]
     seconds: float
     """Of training, as far as it was taken."""
@@ -118,37 +118,37 @@ class Table:
     """Runs by state."""
 
     def at(self, row: str, scope: str, metric: str) -> Figure:
-        """The figure of a row, scope and metric."""
+        """Returns the figure of a row, scope and metric."""
         return next(f for f in self.figures if (f.row, f.scope, f.metric) == (row, scope, metric))
 
 
 def scopes_of(datasets: dict[str, Any], scenes: Sequence[str], published: Published | None) -> list[Scope]:
-    """The columns: those of the paper's table where its datasets are run, else each dataset as a whole."""
-    own = [
+    """Lists the scopes: those of the paper's table where its datasets are run, else each dataset as a whole."""
+    wholes = [
         Scope(title=dataset["title"], dataset=name, scenes=chosen_scenes(dataset, scenes))
         for name, dataset in datasets.items()
         if chosen_scenes(dataset, scenes)
     ]
     known = [scope for title in (published.scopes if published else []) if (scope := matching(title, datasets, scenes))]
     if published and not known:
-        known = [Scope(title=s.title, dataset=s.dataset, scenes=s.scenes, paper=published.scopes[0]) for s in own]
+        known = [Scope(title=s.title, dataset=s.dataset, scenes=s.scenes, paper=published.scopes[0]) for s in wholes]
     singles = [
         Scope(title=datasets[s.dataset]["scenes"][scene], dataset=s.dataset, scenes=[scene])
-        for s in own
+        for s in wholes
         for scene in s.scenes
         if len(s.scenes) > 1
     ]
-    told = {(tuple(scope.scenes), scope.group) for scope in known}
-    return known + [scope for scope in [*own, *singles] if (tuple(scope.scenes), "") not in told]
+    listed = {(tuple(scope.scenes), scope.group) for scope in known}
+    return known + [scope for scope in [*wholes, *singles] if (tuple(scope.scenes), "") not in listed]
 
 
 def chosen_scenes(dataset: dict[str, Any], scenes: Sequence[str]) -> list[str]:
-    """The scenes of a dataset that are run."""
+    """Lists the scenes of a dataset that are run."""
     return [scene for scene in dataset["scenes"] if not scenes or scene in scenes]
 
 
 def matching(title: str, datasets: dict[str, Any], scenes: Sequence[str]) -> Scope | None:
-    """The scope that the paper calls so, if it is among those that are run."""
+    """Returns the scope of that title in the paper, if it is among those that are run."""
     for name, dataset in datasets.items():
         chosen = chosen_scenes(dataset, scenes)
         some = "" if len(chosen) == len(dataset["scenes"]) else f" ({len(chosen)} of {len(dataset['scenes'])} scenes)"
@@ -171,7 +171,7 @@ def table_of(
     lacking: dict[tuple[str, str], str],
     foreign: list[str],
 ) -> Table:
-    """The table, as far as its runs have come; `lacking`: why scenes could not be run, by dataset and scene."""
+    """Gathers the table from its runs; `lacking`: reasons why scenes cannot be run, by dataset and scene."""
     files = {cell.folder: read_run(cell.folder) for cell in cells}
     scopes = scopes_of(datasets, experiment.scenes, published)
     zooms = sorted({z for run in files.values() for z in part(run.evaluation, "zoom") if float(z) > 1}, key=float)
@@ -198,7 +198,7 @@ def table_of(
 
 
 def rows_of(experiment: Experiment) -> list[str]:
-    """Rows of the table: quoted ones first."""
+    """Lists the rows of the table: quoted ones first."""
     return [*experiment.quoted, *experiment.chosen]
 
 
@@ -211,7 +211,7 @@ def figure(
     published: Published | None,
     lacking: dict[tuple[str, str], str],
 ) -> Figure:
-    """One cell: the mean over scenes of the mean over seeds, if all of them are there."""
+    """Computes a cell: the mean over scenes of the mean over seeds, if all of them are done."""
     inside = [cell for cell in cells if cell.dataset == scope.dataset and cell.scene in scope.scenes]
     found = {(cell.scene, cell.seed): measured(files[cell.folder], metric, scope.group) for cell in inside}
     values = {place: value for place, value in found.items() if value is not None}
@@ -233,18 +233,18 @@ def figure(
         paper=paper,
         difference=ours - paper if complete and ours is not None and paper is not None else None,
         problem="" if complete else problem_of(inside, files, lacking, metric),
-        remarks=tuple(dict.fromkeys(told for cell in inside for told in remarks_on(cell, files))),
+        remarks=tuple(dict.fromkeys(remark for cell in inside for remark in remarks_on(cell, files))),
         by_seed=tuple(by_seed),
     )
 
 
 def remarks_on(cell: Cell, files: dict[Path, RunFiles]) -> list[str]:
-    """What a reader must know of a run, with its row and scene."""
+    """Lists the remarks on a run, with its row and scene."""
     return [f"{cell.row}, {cell.scene}: {remark}" for remark in remarks_of(files[cell.folder].evaluation)]
 
 
 def measured(files: RunFiles, metric: str, group: str) -> float | None:
-    """A figure of a run that is done."""
+    """Returns a figure of a run that is done."""
     if not has_figures(files):
         return None
     if " x" in metric:
@@ -255,7 +255,7 @@ def measured(files: RunFiles, metric: str, group: str) -> float | None:
 
 
 def zoom_figure(evaluation: dict[str, Any], metric: str) -> float | None:
-    """`NAME xK`, by ZOOM_MEASURES."""
+    """Returns the figure of `NAME xK`, by ZOOM_MEASURES."""
     name, _, factor = metric.partition(" x")
     value = ZOOM_MEASURES[name](part(part(evaluation, "zoom"), factor))
     return value if is_number(value) else None
@@ -264,7 +264,7 @@ def zoom_figure(evaluation: dict[str, Any], metric: str) -> float | None:
 def problem_of(
     cells: Sequence[Cell], files: dict[Path, RunFiles], lacking: dict[tuple[str, str], str], metric: str
 ) -> str:
-    """Why figures are missing, by the first run that lacks one."""
+    """Returns why figures are missing, by the first run that lacks one."""
     for cell in cells:
         if (reason := lacking.get((cell.dataset, cell.scene))) and not files[cell.folder].evaluation:
             return f"no data: {reason}"
@@ -280,7 +280,7 @@ def problem_of(
 
 
 def with_gains(figures: Sequence[Figure], baseline: str) -> list[Figure]:
-    """The figures with their gains over the baseline's row."""
+    """Adds to figures their gains over the baseline's row."""
     base = {(f.scope, f.metric): f for f in figures if f.row == baseline}
 
     def gain(f: Figure, value: float | None, other: float | None) -> float | None:
@@ -298,13 +298,13 @@ def with_gains(figures: Sequence[Figure], baseline: str) -> list[Figure]:
 
 
 def paired_spread(figure: Figure, base: Figure) -> float | None:
-    """Half of the range of a gain over the seeds; None with a single one."""
-    gains = [own - other for own, other in zip(figure.by_seed, base.by_seed, strict=True)]
+    """Returns half of the range of a gain over the seeds; None with a single one."""
+    gains = [value - other for value, other in zip(figure.by_seed, base.by_seed, strict=True)]
     return spread(gains) if len(gains) > 1 else None
 
 
 def seconds_of(files: RunFiles) -> float:
-    """Seconds of training that a run has taken itself."""
+    """Returns the seconds of training that a run has taken itself."""
     seconds = files.evaluation.get("train_seconds")
     if not is_number(seconds):
         seconds = files.lines[-1].get("seconds", 0.0) if files.lines else 0.0
@@ -312,7 +312,7 @@ def seconds_of(files: RunFiles) -> float:
 
 
 def saved_by(folder: Path) -> float:
-    """Seconds of training that a run did not have to take, since it branched from another."""
+    """Returns the seconds of training that a run saved by branching from another."""
     try:
         return float(read_json(folder / BRANCH)["seconds"])
     except (OSError, ValueError, KeyError):
@@ -320,7 +320,7 @@ def saved_by(folder: Path) -> float:
 
 
 def counted(files: dict[Path, RunFiles], cells: Sequence[Cell], lacking: dict[tuple[str, str], str]) -> dict[str, int]:
-    """Runs by state."""
+    """Counts runs by state."""
     counts: dict[str, int] = {}
     for folder, run in files.items():
         absent = any((cell.dataset, cell.scene) in lacking for cell in cells if cell.folder == folder)
@@ -332,9 +332,9 @@ def counted(files: dict[Path, RunFiles], cells: Sequence[Cell], lacking: dict[tu
 def notes_of(
     experiment: Experiment, cells: Sequence[Cell], files: dict[Path, RunFiles], published: Published | None
 ) -> list[str]:
-    """What a reader must know beside the figures."""
+    """Lists the notes below the figures."""
     notes = [f"{row}: {reason}" for row, reason in experiment.quoted.items()]
-    notes += dict.fromkeys(f"* {told}" for cell in cells for told in remarks_on(cell, files))
+    notes += dict.fromkeys(f"* {remark}" for cell in cells for remark in remarks_on(cell, files))
     notes += [f"corrected: {note}" for note in (published.notes if published else [])]
     shared: dict[Path, list[str]] = {}
     for cell in cells:
@@ -351,55 +351,49 @@ def notes_of(
 
 
 def scene_notes(files: RunFiles) -> list[str]:
-    """What was said of a run's scene when it was loaded: images that were absent, above all."""
+    """Lists the notes of loading a run's scene: absent images, above all."""
     notes = part(files.environment, "scene").get("notes")
     return [str(note) for note in notes] if isinstance(notes, list) else []
 
 
 def of_other_revisions(cells: Sequence[Cell], files: dict[Path, RunFiles]) -> list[str]:
-    """Which rows hold results of another revision of gsx's source than this one, and in how many of their runs."""
+    """Names the rows with results of another revision of gsx's source, and in how many of their runs."""
     this = source_revision()
-    found = {folder: other_revision(run, this) for folder, run in files.items() if run.evaluation}
+    revisions = {folder: other_revision(run, this) for folder, run in files.items() if run.evaluation}
     notes = []
-    for revision in sorted({revision for revision in found.values() if revision}):
-        shares = [share_of(row, revision, cells, found) for row in dict.fromkeys(cell.row for cell in cells)]
-        told = ", ".join(share for share in shares if share)
-        notes.append(f"trained by another revision of gsx's source ({revision}, this is {this}): {told}")
+    for revision in sorted({revision for revision in revisions.values() if revision}):
+        shares = [share_of(row, revision, cells, revisions) for row in dict.fromkeys(cell.row for cell in cells)]
+        rows = ", ".join(share for share in shares if share)
+        notes.append(f"trained by another revision of gsx's source ({revision}, this is {this}): {rows}")
     return notes
 
 
-def share_of(row: str, revision: str, cells: Sequence[Cell], found: dict[Path, str]) -> str:
-    """How many results of a row are of that revision, in words; empty if none is. `found`: revisions by folder."""
-    own = [found[folder] for folder in {cell.folder for cell in cells if cell.row == row} if folder in found]
-    count = own.count(revision)
-    return f"{row} ({count} of {len(own)} runs)" if count else ""
+def share_of(row: str, revision: str, cells: Sequence[Cell], revisions: dict[Path, str]) -> str:
+    """Describes how many results of a row are of a revision; empty if none is. `revisions`: by folder."""
+    of_row = [revisions[folder] for folder in {c.folder for c in cells if c.row == row} if folder in revisions]
+    count = of_row.count(revision)
+    return f"{row} ({count} of {len(of_row)} runs)" if count else ""
 
 
 def protocol_differences(compared: Sequence[tuple[dict[str, Any], dict[str, Any], frozenset[str]]]) -> list[str]:
-    """In which keys compositions (as run, as published) differ, each with its values, those of most rows first.
+    """Lists the keys in which compositions differ, with both values, those of most rows first.
 
-    `compared`: both, and what of them has no effect.
+    `compared`: (as run, as published, keys without effect) of each row.
     """
     found: dict[str, list[tuple[str, str]]] = {}
     for own, paper, idle in compared:
         for key, value, published in differing(own, paper, idle):
             found.setdefault(key, []).append((value, published))
-    ranked = sorted(found, key=lambda key: -len(found[key]))
-    told = []
-    for key in ranked:
-        ours, theirs = zip(*found[key], strict=True)
-        told.append(f"{key}={listed(ours)} (paper: {listed(theirs)})")
-    more = [f"and {len(told) - SHOWN_KEYS} more"] if len(told) > SHOWN_KEYS else []
-    return told[:SHOWN_KEYS] + more
-
-
-def listed(values: Sequence[str]) -> str:
-    """Different values, in order."""
-    return ", ".join(dict.fromkeys(values))
+    lines = []
+    for key in sorted(found, key=lambda key: -len(found[key])):
+        ours, theirs = (", ".join(dict.fromkeys(values)) for values in zip(*found[key], strict=True))
+        lines.append(f"{key}={ours} (paper: {theirs})")
+    more = [f"and {len(lines) - SHOWN_KEYS} more"] if len(lines) > SHOWN_KEYS else []
+    return lines[:SHOWN_KEYS] + more
 
 
 def differing(own: dict[str, Any], paper: dict[str, Any], idle: frozenset[str]) -> Iterator[tuple[str, str, str]]:
-    """Keys whose values differ, with ours and the paper's; of a component that is another one only its name."""
+    """Yields keys whose values differ, with ours and the paper's; of another component only its name."""
     mine, theirs = (comparable(protocol_settings(config, idle)) for config in (own, paper))
     others = {key.removesuffix(".name") for key in mine if key.endswith(".name") and mine[key] != theirs.get(key)}
     for key in dict.fromkeys([*mine, *theirs]):
@@ -409,7 +403,7 @@ def differing(own: dict[str, Any], paper: dict[str, Any], idle: frozenset[str]) 
 
 
 def protocol_settings(config: dict[str, Any], idle: frozenset[str]) -> dict[str, Any]:
-    """What of a composition makes its protocol: all but where it runs, its seed, and which zooms are looked at."""
+    """Returns the protocol of a composition: all but where it runs, its seed and its zooms."""
     known = without(config, idle)
     kept = {key: value for key, value in known.items() if key not in (*WHERE, *NAMES, "seed")}
     kept["dataset"] = part(known, "dataset").get("title")
@@ -419,7 +413,7 @@ def protocol_settings(config: dict[str, Any], idle: frozenset[str]) -> dict[str,
 
 
 def placeless(node: Any) -> Any:
-    """Regenerators without where their models come from and how they are held in memory."""
+    """Removes from regenerators where their models come from and how they fit into memory."""
     if not isinstance(node, dict):
         return node
     return {key: placeless(value) for key, value in node.items() if key not in PLACES}

@@ -14,17 +14,17 @@ FIELDS = (
 
 
 def digits(metric: str) -> int:
-    """Decimals of a metric, as the paper prints it."""
+    """Returns the decimals of a metric, as the paper prints it."""
     return DIGITS.get(metric.partition(" x")[0], 2)
 
 
 def number(value: float | None, metric: str, sign: bool = False) -> str:
-    """A figure, or nothing; with a sign where it is a difference."""
+    """Formats a figure, if there is one; with a sign where it is a difference."""
     return "" if value is None else f"{value:{'+' if sign else ''}.{digits(metric)}f}"
 
 
 def ours(figure: Figure) -> str:
-    """Our figure with its spread; in brackets where scenes are missing, with a star where a note tells more of it."""
+    """Formats our figure with its spread; in brackets where scenes are missing, with a star where it has a note."""
     if figure.ours is None:
         return "-"
     text = number(figure.ours, figure.metric)
@@ -35,34 +35,34 @@ def ours(figure: Figure) -> str:
 
 
 def gained(figure: Figure) -> str:
-    """The gain over the baseline, ± its own spread."""
+    """Formats the gain over the baseline, ± its spread."""
     varied = number(figure.gain_spread, figure.metric)
     return number(figure.gain, figure.metric, sign=True) + (f" ± {varied}" if varied else "")
 
 
 def headings(table: Table, scope: Scope) -> list[tuple[str, str]]:
-    """(metric, what of it) of each column."""
+    """Lists (metric, what of it) of each column."""
     columns = []
-    for metric in shown(table, scope):
+    for metric in metrics_of(table, scope):
         columns.append((metric, "ours"))
         if any(table.at(row, scope.title, metric).paper is not None for row in rows_of(table.experiment)):
             columns += [(metric, "paper"), (metric, "difference")]
     return columns
 
 
-def shown(table: Table, scope: Scope) -> list[str]:
-    """Metrics that have figures in this scope, of ours or the paper's."""
+def metrics_of(table: Table, scope: Scope) -> list[str]:
+    """Lists the metrics with figures in this scope, ours or the paper's."""
 
-    def told(metric: str) -> bool:
+    def has_figures(metric: str) -> bool:
         figures = [table.at(row, scope.title, metric) for row in rows_of(table.experiment)]
         return any(f.ours is not None or f.paper is not None for f in figures)
 
-    return [metric for metric in table.metrics if told(metric)]
+    return [metric for metric in table.metrics if has_figures(metric)]
 
 
 def cells(table: Table, scope: Scope) -> list[list[str]]:
-    """The grid of a scope: headings, then rows; with gains in the first metric over the baseline."""
-    columns, lead = headings(table, scope), next(iter(shown(table, scope)), "")
+    """Returns the grid of a scope: headings, then rows; with gains in the first metric over the baseline."""
+    columns, lead = headings(table, scope), next(iter(metrics_of(table, scope)), "")
     head = ["", *(f"{METRICS.get(m, m)} {what}" if what == "ours" else what for m, what in columns)]
     gains = ["gain", "gain in the paper"] if lead else []
     rows = []
@@ -80,7 +80,7 @@ def cells(table: Table, scope: Scope) -> list[list[str]]:
 
 
 def problems(table: Table) -> list[str]:
-    """Why figures are missing: each reason once, with the rows it holds for."""
+    """Lists why figures are missing: each reason once, with its rows."""
     rows: dict[str, list[str]] = {}
     for f in table.figures:
         if f.problem and f.row not in table.experiment.quoted and f.row not in rows.setdefault(f.problem, []):
@@ -90,7 +90,7 @@ def problems(table: Table) -> list[str]:
 
 
 def face(table: Table) -> list[str]:
-    """What a reader must see before any figure."""
+    """Returns title and warnings, above all figures."""
     lines = [table.experiment.title]
     if table.foreign:
         lines.append(f"NOT the paper's protocol: {'; '.join(table.foreign)}")
@@ -98,7 +98,7 @@ def face(table: Table) -> list[str]:
 
 
 def foot(table: Table) -> list[str]:
-    """What stands below the figures."""
+    """Lists the notes below the figures."""
     states = ", ".join(f"{count} {state}" for state, count in table.states.items())
     baseline = table.experiment.baseline
     absent = "" if baseline in table.experiment.chosen else ", which is not run: there are none of ours"
@@ -115,7 +115,7 @@ def foot(table: Table) -> list[str]:
 
 
 def as_text(table: Table) -> str:
-    """For the terminal."""
+    """Formats the table for the terminal."""
     blocks = ["\n".join(face(table))]
     for scope in table.scopes:
         grid = cells(table, scope)
@@ -124,28 +124,28 @@ def as_text(table: Table) -> str:
 
 
 def title_of(scope: Scope) -> str:
-    """A scope, and the paper's beside it where that is another one."""
+    """Returns the title of a scope, and the paper's where that is another one."""
     beside = f", beside {scope.paper} in the paper" if scope.paper and scope.paper != scope.title else ""
     count = f" ({len(scope.scenes)} scenes)" if len(scope.scenes) > 1 else ""
     return f"{scope.title}{count}{beside}"
 
 
 def aligned(grid: Sequence[Sequence[str]]) -> list[str]:
-    """Columns under each other, figures to the right."""
+    """Aligns columns, figures to the right."""
     widths = [max(len(line[i]) for line in grid) for i in range(len(grid[0]))]
     padded = [[line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])] for line in grid]
     return ["  ".join(words).rstrip() for words in padded]
 
 
 def as_csv(table: Table) -> str:
-    """One line for each figure; missing ones are empty."""
+    """Formats the table as CSV, a line for each figure; missing ones are empty."""
     return csv_text(
         FIELDS, ({key: getattr(f, key) for key in FIELDS} | {"remarks": "; ".join(f.remarks)} for f in table.figures)
     )
 
 
 def as_markdown(table: Table) -> str:
-    """For a page."""
+    """Formats the table as Markdown."""
     title, *warnings = face(table)
     blocks = [f"# {title}", *(f"**{warning}**" for warning in warnings)]
     for scope in table.scopes:
@@ -157,7 +157,7 @@ def as_markdown(table: Table) -> str:
 
 
 def as_latex(table: Table) -> str:
-    """For a paper: one tabular for each scope, with package booktabs."""
+    """Formats the table as LaTeX: one tabular for each scope, with package booktabs."""
     title, *warnings = face(table)
     out = [f"% {line}" for line in [title, *warnings]]
     for scope in table.scopes:
@@ -180,7 +180,7 @@ def as_latex(table: Table) -> str:
 
 
 def escaped(text: str) -> str:
-    """Text with LaTeX's special characters taken literally."""
+    """Escapes LaTeX's special characters."""
     for character in "\\&%$#_{}":
         text = text.replace(character, r"\textbackslash " if character == "\\" else f"\\{character}")
     return text.replace("±", r"$\pm$").replace("~", r"\textasciitilde ").replace("^", r"\textasciicircum ")

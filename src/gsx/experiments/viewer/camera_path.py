@@ -50,7 +50,7 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Keyframes in order of time, and how they are to be filmed."""
+    """Keyframes in order of time, size and frame rate."""
 
     size: tuple[int, int]
     """Width and height of the pictures, px."""
@@ -58,27 +58,27 @@ class CameraPath:
     keyframes: tuple[Keyframe, ...]
 
     def cameras(self, zoom: float = 1.0) -> list[Camera]:
-        """A camera for every frame from the first keyframe to the last; `zoom`: times the raster."""
+        """Returns a camera for every frame from the first keyframe to the last; `zoom`: times the raster."""
         frames = self.keyframes
         count = 1 + round((frames[-1].time - frames[0].time) * self.fps)
         times = [min(frames[0].time + number / self.fps, frames[-1].time) for number in range(count)]
         return [self.camera(between(frames, time)).zoom(zoom) for time in times]
 
     def camera(self, frame: Keyframe) -> Camera:
-        """The pinhole camera of a keyframe."""
+        """Returns the pinhole camera of a keyframe."""
         return posed(frame.position, frame.wxyz, frame.fov, *self.size)
 
 
 def posed(position: Sequence[float], wxyz: Sequence[float], fov: float, width: int, height: int) -> Camera:
-    """A camera of square pixels; `wxyz`: camera to world, `fov`: vertical, radians."""
+    """Returns a camera of square pixels; `wxyz`: camera to world, `fov`: vertical, radians."""
     rotation = rotation_matrices(torch.tensor([wxyz], dtype=torch.float64))[0].T
     translation = -rotation @ torch.tensor(position, dtype=torch.float64)
     return pinhole(rotation, translation, height / (2 * math.tan(fov / 2)), width, height)
 
 
 def between(frames: Sequence[Keyframe], time: float) -> Keyframe:
-    """The camera at a time: positions along a cubic through the keyframes (finite differences as slopes), rotations
-    on the shortest arc, the logarithm of tan(fov / 2) linear."""
+    """Interpolates keyframes at a time: positions on a cubic with finite differences as slopes, rotations on the
+    shortest arc, the logarithm of tan(fov / 2) linearly."""
     after = min(bisect_left(frames, time - 1e-9, key=lambda frame: frame.time), len(frames) - 1)
     if after == 0 or math.isclose(frames[after].time, time, abs_tol=1e-9):
         return replace(frames[after], time=time)
@@ -94,7 +94,7 @@ def between(frames: Sequence[Keyframe], time: float) -> Keyframe:
 
 
 def hermite(frames: Sequence[Keyframe], after: int, t: float) -> tuple[float, float, float]:
-    """Position at a share t of the way to keyframe `after`."""
+    """Interpolates the position at a share t of the way to keyframe `after`."""
     a, b = frames[after - 1], frames[after]
     start, end = (torch.tensor(frame.position, dtype=torch.float64) for frame in (a, b))
     lead, trail = ((b.time - a.time) * slope(frames, i) for i in (after - 1, after))
@@ -104,7 +104,7 @@ def hermite(frames: Sequence[Keyframe], after: int, t: float) -> tuple[float, fl
 
 
 def slope(frames: Sequence[Keyframe], i: int) -> torch.Tensor:
-    """Velocity at a keyframe: from its neighbour on one side to that on the other."""
+    """Returns the velocity at a keyframe, from one neighbour to the other."""
     a, b = frames[max(0, i - 1)], frames[min(len(frames) - 1, i + 1)]
     way = torch.tensor(b.position, dtype=torch.float64) - torch.tensor(a.position, dtype=torch.float64)
     return way / (b.time - a.time)
@@ -113,7 +113,7 @@ def slope(frames: Sequence[Keyframe], i: int) -> torch.Tensor:
 def slerp(
     a: tuple[float, float, float, float], b: tuple[float, float, float, float], t: float
 ) -> tuple[float, float, float, float]:
-    """The rotation at a share of the shortest arc from a to b (Shoemake 1985)."""
+    """Interpolates the rotation at a share of the shortest arc from a to b (Shoemake 1985)."""
     p, q = (torch.tensor(one, dtype=torch.float64) / math.hypot(*one) for one in (a, b))
     cosine = float(p @ q)
     q, cosine = (-q, -cosine) if cosine < 0 else (q, cosine)
@@ -127,24 +127,24 @@ def slerp(
 
 
 def write_camera_path(path: Path, made: CameraPath) -> None:
-    """Write a file of ours."""
+    """Writes a file of gsx."""
     frames = [{"time": frame.time, "position": list(frame.position), "wxyz": list(frame.wxyz),
                "fov": math.degrees(frame.fov)} for frame in made.keyframes]  # fmt: skip
     write_json(path, {OWN: VERSION, "size": list(made.size), "fps": made.fps, "keyframes": frames})
 
 
 def read_camera_path(path: Path) -> CameraPath:
-    """A file of ours, or of nerfstudio.
+    """Reads a file of gsx or nerfstudio.
 
     Raises:
-        InputError: it is neither, or says something that no camera can be.
+        InputError: it is neither, or holds values that no camera has.
     """
     try:
         content = read_json(path)
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"camera path '{path}' cannot be read ({error}): give a JSON file") from error
     try:
-        made = own(content) if isinstance(content, dict) and OWN in content else of_nerfstudio(content)
+        made = of_gsx(content) if isinstance(content, dict) and OWN in content else of_nerfstudio(content)
         refuse_odd(made)
     except (KeyError, TypeError, ValueError, IndexError, ArithmeticError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
@@ -155,7 +155,7 @@ def read_camera_path(path: Path) -> CameraPath:
 
 
 def refuse_odd(path: CameraPath) -> None:
-    """Raise ValueError for what cannot be filmed."""
+    """Raises ValueError for a path that cannot be rendered."""
     times = [frame.time for frame in path.keyframes]
     if not times or any(later <= earlier for earlier, later in pairwise(times)):
         raise ValueError("has no keyframes whose times increase")
@@ -169,8 +169,8 @@ def refuse_odd(path: CameraPath) -> None:
         raise ValueError("has a rotation that is none")
 
 
-def own(content: dict[str, Any]) -> CameraPath:
-    """Of gsx."""
+def of_gsx(content: dict[str, Any]) -> CameraPath:
+    """Reads the content of a file of gsx."""
     if content[OWN] != VERSION:
         raise ValueError(f"is of version {content[OWN]}, and this gsx reads version {VERSION}")
     frames = [
@@ -183,14 +183,14 @@ def own(content: dict[str, Any]) -> CameraPath:
 
 
 def of_nerfstudio(content: Any) -> CameraPath:
-    """Of nerfstudio, a keyframe each frame."""
+    """Reads the content of a file of nerfstudio, a keyframe for each frame."""
     if not isinstance(content, dict) or content.get("camera_type", "perspective") != "perspective":
         raise ValueError("is no path of perspective cameras")
     entries = listed(content["camera_path"])
     pace = "fps" if "fps" in content else "seconds"
-    if not (told := number(content[pace])) > 0:
-        raise ValueError(f"has {told:g} for {pace}, which no film has")
-    fps = told if pace == "fps" else len(entries) / told
+    if not (value := number(content[pace])) > 0:
+        raise ValueError(f"has {value:g} for {pace}, which no film has")
+    fps = value if pace == "fps" else len(entries) / value
     frames = []
     for i, entry in enumerate(entries):
         matrix = torch.tensor(numbers(entry["camera_to_world"], 16), dtype=torch.float64).view(4, 4)
@@ -206,21 +206,21 @@ def of_nerfstudio(content: Any) -> CameraPath:
 
 
 def number(value: Any) -> float:
-    """A finite number; else ValueError."""
+    """Returns a finite number; raises ValueError for others."""
     if not is_number(value):
         raise ValueError(f"has {value!r} where a number should be")
     return float(value)
 
 
 def listed(value: Any) -> list[Any]:
-    """A list; else ValueError."""
+    """Returns a list; raises ValueError for others."""
     if not isinstance(value, list):
         raise ValueError(f"has {value!r} where a list should be")
     return value
 
 
 def numbers(values: Any, count: int) -> Any:
-    """So many finite numbers, of a list or of lists in it; else ValueError."""
+    """Returns `count` finite numbers of a list or of lists in it; raises ValueError for others."""
     flat = [one for row in listed(values) for one in (row if isinstance(row, list) else [row])]
     if len(flat) != count:
         raise ValueError(f"has {len(flat)} numbers where {count} should be")

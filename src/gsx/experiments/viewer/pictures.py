@@ -1,4 +1,4 @@
-"""What a viewer shows: a model from anywhere, by the rasterizer that trained it, alone or beside something else."""
+"""Pictures of a viewer: a model from anywhere, by the rasterizer that trained it, alone or next to something else."""
 
 import math
 from dataclasses import dataclass, replace
@@ -20,17 +20,17 @@ from gsx.experiments.viewer.camera_path import posed
 from gsx.formats.origin import NO_ORIGIN, Origin
 
 BESIDE = ("nothing", "photograph", "error", "x1, enlarged")
-"""What the right part of the picture may show: the photograph of the view one has jumped to, how far the render is
-from it, or the same camera at the resolution of the photographs, enlarged."""
+"""Right part of the picture: the photo of the view that the user jumped to, the error of the render, or the same
+camera at the resolution of the photos, enlarged."""
 FILTERS = ("as trained", "plain 3D-GS", "compensated")
 """Screen filters: the model's own, dilation by 0.3 px^2 without and with compensated opacities."""
 ERROR_GAIN = 4.0
-"""Errors are shown so many times as large."""
+"""Factor on errors."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a browser looks from, and how large its canvas is."""
+    """Camera and canvas size of a browser."""
 
     position: tuple[float, float, float]
     wxyz: tuple[float, float, float, float]
@@ -43,23 +43,23 @@ class Pose:
 
 @dataclass(frozen=True)
 class Look:
-    """What a panel says about the picture."""
+    """Settings of the picture in a panel."""
 
     zoom: float = 1.0
     beside: str = "nothing"
     split: float = 0.5
-    """Where the other picture begins, of the width."""
+    """Share of the width at which the right picture begins."""
     filter: str = "as trained"
     finer_levels: float = 0.0
     """Levels of detail of a camera that is 2^this times as fine."""
     box: float = 1.0
     """Half edge of the cube about the scene's middle outside of which nothing is drawn, of its extent; 1: no cube."""
     view: str = ""
-    """The view one has jumped to and not left since."""
+    """Name of the view that the user jumped to and has not left."""
 
 
 def camera_of(pose: Pose, width: int, zoom: float = 1.0) -> Camera:
-    """The pinhole camera of a pose on a raster of that width, its field of view narrowed by `zoom`."""
+    """Returns the pinhole camera of a pose on a raster of that width, its field of view narrowed by `zoom`."""
     height = max(1, round(width * pose.height / pose.width))
     return posed(pose.position, pose.wxyz, 2 * math.atan(math.tan(pose.fov / 2) / zoom), width, height)
 
@@ -76,30 +76,30 @@ class RunModel:
         return self.run.scene.origin
 
     def drawn(self, camera: Camera, look: Look) -> Float[Tensor, "3 H W"]:
-        """The model alone."""
+        """Renders the model alone."""
         splats = splats_for(self.run, camera.zoom(2.0**look.finer_levels))
         shown = inside(splats, self.middle(), look.box * self.run.scene.extent) if look.box < 1 else splats
         return render(replace(self.run, raster=filtered(self.run.raster, look.filter)), camera, splats=shown).image
 
     def middle(self) -> Float[Tensor, "3"]:
-        """Of the points that it began with, or of its cameras."""
+        """Returns the median of the initial points, or of the cameras."""
         points = self.run.scene.points.positions
         centres = torch.stack([view.camera.centre for view in self.run.scene.train]).float()
         return (points if len(points) else centres).median(0).values
 
     @property
     def focal(self) -> float:
-        """Of the photographs, px; per px of their height."""
+        """Returns the focal length of the photos, px per px of their height."""
         camera = self.run.scene.train[0].camera
         return camera.fy / camera.height
 
     @property
     def height(self) -> int:
-        """Of the photographs, px."""
+        """Returns the height of the photos, px."""
         return self.run.scene.train[0].camera.height
 
     def views(self) -> dict[str, View]:
-        """Training and test views by name."""
+        """Returns training and test views by name."""
         return {view.name: view for view in (*self.run.scene.test, *self.run.train_views)}
 
 
@@ -112,29 +112,29 @@ class FileModel:
     origin: Origin = NO_ORIGIN
     """Added to positions for the coordinates of the file."""
     height: int = 480
-    """Of photographs that nobody knows."""
+    """Assumed height of photos, px."""
     focal: float = 0.5
-    """Theirs, per px of their height."""
+    """Assumed focal length, px per px of height."""
 
     @torch.no_grad()
     def drawn(self, camera: Camera, look: Look) -> Float[Tensor, "3 H W"]:
-        """The model alone, over black."""
+        """Renders the model alone, over black."""
         splats = splats_of(self.gaussians, camera.centre)
         shown = inside(splats, self.middle(), look.box * self.reach()) if look.box < 1 else splats
         raster = filtered(self.raster, look.filter)
         return rasterize_tiled(shown, camera, raster, background=torch.zeros(3)).image.clamp_(0, 1)
 
     def reach(self) -> float:
-        """From the middle to the farthest but a tenth."""
+        """Returns the 0.9 quantile of distances from the middle."""
         far = (self.gaussians.means - self.middle()).norm(dim=1)
         return float(far.kthvalue(max(1, round(0.9 * len(far)))).values)
 
     def middle(self) -> Float[Tensor, "3"]:
-        """Of the splats."""
+        """Returns the median of the splats."""
         return self.gaussians.means.median(0).values
 
     def views(self) -> dict[str, View]:
-        """None."""
+        """Returns no views."""
         return {}
 
 
@@ -142,20 +142,20 @@ Model = RunModel | FileModel
 
 
 def filtered(raster: RasterSettings, name: str) -> RasterSettings:
-    """Rules of the rasterizer with another screen filter; eager, since nobody waits for a compiler to look once."""
+    """Returns rules of the rasterizer with another screen filter; eager, since compiling would delay one picture."""
     if name == "as trained":
         return raster
     return replace(raster, dilation=0.3, compensate=name == "compensated", zoomed="plain", pixel="sample", path="eager")
 
 
 def inside(splats: Splats, middle: Float[Tensor, "3"], reach: float) -> Splats:
-    """The splats in a cube."""
+    """Selects the splats in a cube."""
     kept = ((splats.means - middle.to(splats.means)).abs() <= reach).all(1)
     return Splats(**{name: value[kept] for name, value in vars(splats).items()})
 
 
 def picture(model: Model, pose: Pose, look: Look, width: int) -> Float[Tensor, "3 H W"]:
-    """What the browser is sent, of that width."""
+    """Renders the picture for a browser."""
     camera = camera_of(pose, width, look.zoom)
     shown = model.drawn(camera, look)
     if look.beside == "x1, enlarged":
@@ -169,7 +169,7 @@ def picture(model: Model, pose: Pose, look: Look, width: int) -> Float[Tensor, "
 
 
 def split(left: Float[Tensor, "3 H W"], right: Float[Tensor, "3 H W"], at: float) -> Float[Tensor, "3 H W"]:
-    """Two pictures, of which the second begins at a share of the width, with a white line between."""
+    """Joins two pictures at a share of the width, with a white line between."""
     column = round(at * left.shape[2])
     joined = torch.cat([left[..., :column], right[..., column:]], 2)
     joined[..., max(0, column - 1) : column] = 1
@@ -177,7 +177,7 @@ def split(left: Float[Tensor, "3 H W"], right: Float[Tensor, "3 H W"], at: float
 
 
 def enlarged(model: Model, pose: Pose, look: Look, like: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """The same camera as fine as the photographs, before it is zoomed; enlarged by Keys bicubic."""
+    """Renders the same camera at the resolution of the photos, and enlarges it by Keys bicubic."""
     per_pixel = 2 * math.tan(pose.fov / 2) * model.focal
     height = max(2, round(model.height * per_pixel / look.zoom))
     small = camera_of(pose, max(2, round(height * pose.width / pose.height)), look.zoom)
@@ -187,7 +187,7 @@ def enlarged(model: Model, pose: Pose, look: Look, like: Float[Tensor, "3 H W"])
 def placed(
     photo: Float[Tensor, "3 h w"], taken_by: Camera, camera: Camera
 ) -> tuple[Float[Tensor, "3 H W"], Bool[Tensor, "H W"]]:
-    """(a photograph where it lies in the raster of a camera at the same place, which pixels it covers)."""
+    """Resamples a photo to a camera at the same place; returns (picture, pixels that it covers)."""
     scale = camera.fy / taken_by.fy
     columns = (torch.arange(camera.width).to(photo) + 0.5 - camera.cx) * (taken_by.fx / camera.fx) + taken_by.cx
     rows = (torch.arange(camera.height).to(photo) + 0.5 - camera.cy) / scale + taken_by.cy

@@ -1,4 +1,4 @@
-"""A model in a browser: viser shows pictures that our own rasterizer draws, and asks what is to be drawn."""
+"""A model in a browser: viser shows pictures that gsx's rasterizer draws, and sends what to draw."""
 
 import logging
 import math
@@ -34,18 +34,18 @@ logger = logging.getLogger(__name__)
 LOCAL = "127.0.0.1"
 JPEG_QUALITY = 90
 FRUSTUM = 0.03
-"""Size of the cameras that are shown, of the scene's extent."""
+"""Size of camera frusta, of the scene's extent."""
 COLOURS = {"training": (60, 110, 200), "test": (220, 120, 40)}
 ARRIVAL = 20.0
-"""Seconds that a browser has to arrive at a view."""
+"""Seconds within which a browser arrives at a view."""
 KEYFRAME_SECONDS = 1.0
-"""Between two keyframes of a camera path."""
+"""Seconds between two keyframes of a camera path."""
 ABSENCE = 60.0
 """Seconds without any browser after which training that was paused goes on."""
 
 
 class Viewer:
-    """A server, its browsers, and the model that they see."""
+    """A server, its browsers, and the model that they show."""
 
     def __init__(self, model: Model, title: str, host: str = LOCAL, port: int = 8080, training: bool = False) -> None:
         require("gsx view", ("viser",), "gsx[viewer]")
@@ -53,12 +53,12 @@ class Viewer:
 
         self.frames, self.title, self.folder = FrameServer(model), title, Path.cwd()
         self.training, self.paused, self.keyframes = training, False, list[Keyframe]()
-        self.told = ""
+        self.status = ""
         self.alone_since: float | None = None
         """When the last browser left, s; None: one is there, or none ever came."""
         self.panels: dict[int, Panel] = {}
         refuse_port(host, port)
-        with redirect_stdout(StringIO()):  # its banner; the address is told by us
+        with redirect_stdout(StringIO()):  # its banner; gsx prints the address
             self.server: Any = viser.ViserServer(host=host, port=port, label=f"gsx: {title}", verbose=False)
         self.server.gui.configure_theme(show_share_button=False)  # which would open it to the world
         self.address = f"http://{host}:{self.server.get_port()}"
@@ -67,7 +67,7 @@ class Viewer:
         self.server.on_client_disconnect(self.left)
 
     def place_cameras(self) -> None:
-        """Place training and test cameras, which are shown when asked for."""
+        """Places training and test cameras, invisible at first."""
         model = self.frames.model
         if not isinstance(model, RunModel):
             self.server.scene.set_up_direction("-y")
@@ -80,16 +80,16 @@ class Viewer:
                 self.place_camera(kind, view, FRUSTUM * scene.extent)
 
     def place_camera(self, kind: str, view: View, scale: float) -> None:
-        """Show one camera, to which a click leads."""
+        """Places one camera; a click on it jumps there."""
         pose = pose_of(view, 100)
-        shown = self.server.scene.add_camera_frustum(
+        frustum = self.server.scene.add_camera_frustum(
             f"/{kind}/{view.name}", fov=pose.fov, aspect=view.camera.width / view.camera.height, scale=scale,
             color=COLOURS[kind], wxyz=pose.wxyz, position=pose.position, visible=False,
         )  # fmt: skip
-        shown.on_click(lambda event: self.panels[event.client.client_id].jump(view.name))
+        frustum.on_click(lambda event: self.panels[event.client.client_id].jump(view.name))
 
     def connected(self, client: Any) -> None:
-        """A browser has come."""
+        """Adds a browser."""
         self.alone_since = None
         screen = Screen(partial(send, client))
         self.panels[client.client_id] = panel = Panel(self, client, screen)
@@ -98,38 +98,38 @@ class Viewer:
         self.frames.screens[client.client_id] = screen
 
     def left(self, client: Any) -> None:
-        """A browser has gone."""
+        """Removes a browser."""
         self.frames.screens.pop(client.client_id, None)
         self.panels.pop(client.client_id, None)
         if not self.panels:
             self.alone_since = time.monotonic()
 
     def pausing(self) -> bool:
-        """Whether training is to wait; not for ever where the browser that paused it was closed."""
+        """Returns whether training waits; ends the pause once all browsers have been closed for a while."""
         away = 0.0 if self.alone_since is None else time.monotonic() - self.alone_since
         if self.paused and away > ABSENCE:
             self.paused = False
-            logger.warning("training was paused at %s, where nobody looks any more: it goes on", self.address)
+            logger.warning("training was paused at %s, and no browser is open: training continues", self.address)
         return self.paused
 
-    def changed(self, told: str) -> None:
-        """The model is another now; `told`: how it stands, in words."""
+    def changed(self, status: str) -> None:
+        """Redraws the model, which has changed, and shows its status."""
         self.frames.version += 1
-        self.tell(told)
+        self.show_status(status)
 
-    def tell(self, told: str) -> None:
-        """Say in all panels how the model stands."""
-        self.told = told
+    def show_status(self, status: str) -> None:
+        """Shows the status of the model in all panels."""
+        self.status = status
         for panel in list(self.panels.values()):
-            panel.tell()
+            panel.show_status()
 
     def stop(self) -> None:
-        """Close the server."""
+        """Closes the server."""
         with redirect_stdout(StringIO()):
             self.server.stop()
 
     def serve(self, until: Callable[[], bool], poll: Callable[[], None] = lambda: None) -> None:
-        """Draw whatever is asked for, until told otherwise; `poll` is called between pictures."""
+        """Draws pictures until a condition holds; `poll` is called between pictures."""
         while not until():
             poll()
             if not self.frames.show_next():
@@ -137,7 +137,7 @@ class Viewer:
 
 
 class Panel:
-    """What one browser has beside its picture."""
+    """The controls of one browser."""
 
     def __init__(self, viewer: Viewer, client: Any, screen: Screen) -> None:
         self.viewer, self.client, self.screen, gui = viewer, client, screen, client.gui
@@ -166,31 +166,31 @@ class Panel:
             gui.add_button("save path").on_click(lambda _: self.saving(self.save_path))
             snapshot = gui.add_button("snapshot")
             snapshot.on_click(lambda _: viewer.frames.jobs.append(lambda: self.saving(self.snapshot)))
-        self.tell()
+        self.show_status()
 
     def slider(self, label: str, key: str, least: float, most: float, step: float, value: float) -> None:
-        """A number of the look."""
+        """Adds a slider for a number of the look."""
         handle = self.client.gui.add_slider(label, least, most, step, value)
         handle.on_update(lambda _: self.choose(**{key: handle.value}))
 
     def choose(self, **chosen: object) -> None:
-        """The look is another."""
+        """Changes settings of the picture."""
         self.screen.choose(**chosen)
 
-    def tell(self) -> None:
-        """How the model stands, and how fast pictures come."""
+    def show_status(self) -> None:
+        """Shows the status of the model and the rate of pictures."""
         rate = f", {self.screen.rate:.1f} pictures/s while moving" if self.screen.rate else ""
-        self.state.content = f"**{self.viewer.title}**  \n{self.viewer.told}{rate}{self.place()}"
+        self.state.content = f"**{self.viewer.title}**  \n{self.viewer.status}{rate}{self.place()}"
 
     def place(self) -> str:
-        """Return where the browser looks from, in the coordinates of the files, where these have another origin."""
+        """Returns the position in the coordinates of the files, where these have another origin."""
         origin, pose = self.viewer.frames.model.origin, self.screen.pose
         if pose is None or not any(origin):
             return ""
         return f"  \nat {', '.join(f'{value:.3f}' for value in in_file(pose.position, origin))}"
 
     def begin(self) -> None:
-        """Look from the first test view, or from before the splats."""
+        """Starts at the first test view, or in front of the splats."""
         model = self.viewer.frames.model
         names = list(model.views())
         if names:
@@ -201,12 +201,12 @@ class Panel:
         self.client.camera.look_at = tuple(middle.tolist())
 
     def chosen(self) -> None:
-        """Somebody chose a view; or we did, who have jumped there already."""
+        """Jumps to a view that was chosen in the panel."""
         if self.view.value not in ("-", self.screen.look.view):
             self.jump(self.view.value)
 
     def jump(self, name: str) -> None:
-        """Look from where a photograph was taken."""
+        """Moves the browser's camera to a view."""
         view = self.viewer.frames.model.views()[name]
         pose, camera = pose_of(view, 100), self.client.camera
         with self.lock:
@@ -217,7 +217,7 @@ class Panel:
         self.view.value = name
 
     def moved(self, camera: Any) -> None:
-        """The browser looks from elsewhere."""
+        """Draws from the browser's new camera."""
         x, y, z = map(float, camera.position)
         w, i, j, k = map(float, camera.wxyz)
         size = int(camera.image_width) or 640, int(camera.image_height) or 480
@@ -226,12 +226,12 @@ class Panel:
             if self.on_its_way(pose):
                 return
             self.screen.turn(pose)
-        self.tell()
+        self.show_status()
 
     def on_its_way(self, pose: Pose) -> bool:
-        """Whether the browser has yet to arrive where it was sent; once there, what leads away leaves the view.
+        """Returns whether the browser has yet to arrive at its target; after that, any movement leaves the view.
 
-        One that arrives later than one would wait for it is at the view all the same.
+        A browser that arrives after the patience ended is at the view all the same.
         """
         if self.target is None:
             return False
@@ -244,21 +244,21 @@ class Panel:
         return False
 
     def looks_from(self, name: str) -> None:
-        """The browser is where this photograph was taken; "": elsewhere."""
+        """Notes the view that the browser's camera is at; "": none."""
         if self.screen.look.view != name:
             self.choose(view=name)
             self.view.value = name or "-"
 
-    def show_cameras(self, shown: bool) -> None:
-        """Frusta of all cameras, or none."""
+    def show_cameras(self, visible: bool) -> None:
+        """Shows the frusta of all cameras, or hides them."""
         for name in COLOURS:
             for view in self.viewer.frames.model.views():
                 handle = self.viewer.server.scene.get_handle_by_name(f"/{name}/{view}")
                 if handle is not None:
-                    handle.visible = shown
+                    handle.visible = visible
 
     def add_keyframe(self) -> None:
-        """Remember where one looks from."""
+        """Adds the current camera to the path."""
         if self.screen.pose is None:
             return
         frames, pose = self.viewer.keyframes, self.screen.pose
@@ -269,14 +269,14 @@ class Panel:
         self.notify("keyframe", f"{len(frames)} so far; the path takes {at:g} s")
 
     def saving(self, save: Callable[[], None]) -> None:
-        """Write a file where gsx was started, or say in the browser why that cannot be."""
+        """Writes a file where gsx was started, or shows in the browser why that fails."""
         try:
             save()
         except (OSError, GsxError) as error:
             self.notify("nothing is saved", f"{error}; gsx was started in {self.viewer.folder}")
 
     def save_path(self) -> None:
-        """Write the keyframes where `gsx render` finds them."""
+        """Writes the keyframes as a file for `gsx render`."""
         if self.screen.pose is None or not self.viewer.keyframes:
             self.notify("no path", "add keyframes first")
             return
@@ -286,7 +286,7 @@ class Panel:
         self.notify("path saved", f"{path}: gsx render RUN --path {path.name} --movie FILE.mp4")
 
     def snapshot(self) -> None:
-        """Write the picture as large as the canvas."""
+        """Writes the picture as large as the canvas."""
         if self.screen.pose is None:
             return
         path = free(self.viewer.folder, "snapshot", ".png")
@@ -296,16 +296,16 @@ class Panel:
         self.notify("snapshot", str(path))
 
     def notify(self, title: str, body: str) -> None:
-        """A word in the browser."""
+        """Shows a notification in the browser."""
         self.client.add_notification(title, body, auto_close_seconds=5.0)
 
 
 def refuse_port(host: str, port: int) -> None:
-    """Raise InputError if nothing can listen there: viser would wait for ever, or take another port."""
-    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as tried:
-        tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    """Raises InputError if nothing can listen there: viser would wait for ever, or take another port."""
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            tried.bind((host, port))
+            probe.bind((host, port))
         except (OSError, OverflowError) as error:
             raise InputError(
                 f"a viewer cannot listen at {host}, port {port} ({error}): choose another port, 0 for any that is "
@@ -314,13 +314,13 @@ def refuse_port(host: str, port: int) -> None:
 
 
 def send(client: Any, image: Float[Tensor, "3 H W"]) -> None:
-    """A picture for a browser."""
+    """Sends a picture to a browser."""
     pixels = np.ascontiguousarray(to_uint8(image.cpu()).permute(1, 2, 0).numpy())
     client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=JPEG_QUALITY)
 
 
 def pose_of(view: View, width: int) -> Pose:
-    """The pose of a view's camera; its principal point is taken for the middle."""
+    """Returns the pose of a view's camera, with the principal point in the middle."""
     camera = view.camera
     wxyz = quaternions_of(camera.rotation.T.double()[None])[0]
     fov = 2 * float(np.arctan(camera.height / (2 * camera.fy)))
@@ -329,11 +329,11 @@ def pose_of(view: View, width: int) -> Pose:
 
 
 def in_file(position: tuple[float, float, float], origin: Origin) -> tuple[float, float, float]:
-    """Return a position of the browser in the coordinates of the files that the model comes from."""
+    """Converts a position of the browser to the coordinates of the model's files."""
     x, y, z = (value + by for value, by in zip(position, origin, strict=True))
     return x, y, z
 
 
 def free(folder: Path, stem: str, suffix: str) -> Path:
-    """A name in a folder that no file has yet."""
+    """Returns a free name in a folder."""
     return next(path for n in range(1, 10**6) if not (path := folder / f"{stem}_{n}{suffix}").exists())

@@ -8,11 +8,11 @@ from gsx.experiments.viewer.pictures import RunModel
 from gsx.experiments.viewer.server import Viewer
 
 MOST_CREDIT = 1.0
-"""Seconds of drawing that are saved up where nobody looks."""
+"""Largest credit of drawing time, s."""
 
 
 class TrainingViewer:
-    """Listener: shows the model between steps, for a share of the time that they take."""
+    """Listener that draws pictures between steps, for a share of the time that they take."""
 
     def __init__(self, run: Run, host: str, port: int, share: float) -> None:
         self.viewer = Viewer(RunModel(run), f"{run.scene.name}, {run.folder.name}", host, port, training=True)
@@ -20,9 +20,9 @@ class TrainingViewer:
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
-        """Show pictures while there is time for them, or while training is paused."""
+        """Draws pictures while there is time for them, or while training is paused."""
         viewer, frames = self.viewer, self.viewer.frames
-        viewer.changed(told_of(run))
+        viewer.changed(status_of(run))
         spent, self.credit = frames.spent, min(MOST_CREDIT, self.credit + self.share * (time.monotonic() - self.before))
         while frames.spent - spent < self.credit and frames.show_next():
             pass
@@ -32,12 +32,12 @@ class TrainingViewer:
         self.before = time.monotonic()
 
     def stop(self) -> None:
-        """Close the server; `gsx view RUN` goes on."""
+        """Closes the server; `gsx view RUN` shows the run again."""
         self.viewer.stop()
 
 
-def told_of(run: Run) -> str:
-    """How a run stands, in words."""
+def status_of(run: Run) -> str:
+    """Describes step, primitives and quality of a run."""
     psnr = next((line["test_psnr"] for line in reversed(run.progress.curves) if "test_psnr" in line), None)
     held_out = f", held-out PSNR {psnr:.2f} dB" if psnr is not None else ""
     return f"step {run.step:,} of {run.iterations:,}, {len(run.backbone.table):,} primitives{held_out}"
