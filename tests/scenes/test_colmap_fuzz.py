@@ -30,11 +30,6 @@ LONGEST = 2000
 Damage = Callable[[bytes, random.Random], bytes]
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
-
-
 def cut(content: bytes, dice: random.Random) -> bytes:
     return content[: dice.randrange(len(content) + 1)]
 

@@ -36,13 +36,6 @@ ORIGIN = (0.0, 0.0, 0.0)
 DEFAULTS = Path(__file__).parents[2] / "conf" / "scene" / "demo.yaml"
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Pictures kept on disk stay in the test's folder."""
-    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
-
-
 @pytest.fixture(scope="module")
 def life() -> StillLife:
     return make_still_life()
@@ -445,7 +438,7 @@ def test_points_have_the_colours_of_the_pictures(life, scene):
     assert float(difference.quantile(0.9)) < 25
 
 
-def test_same_options_give_the_same_bytes(scene, own_cache):
+def test_same_options_give_the_same_bytes(scene, cache):
     again = load(options())
     assert torch.equal(again.points.positions, scene.points.positions)
     assert torch.equal(again.points.colours, scene.points.colours)
@@ -461,20 +454,20 @@ def test_downscaled_training_zooms_back_to_the_native_picture():
     assert torch.equal(zoomed.image(), native.train[2].image())
 
 
-def test_whole_views_are_kept_on_disk_and_crops_are_not(own_cache):
+def test_whole_views_are_kept_on_disk_and_crops_are_not(cache):
     first = load(options(points=8)).train[0]
     picture = first.source.image(first.camera)
     first.source.image(first.camera.crop(3, 4, 20, 10))
-    assert len(list(own_cache.rglob("*.png"))) == 1
+    assert len(list(cache.rglob("*.png"))) == 1
     first.source.image(first.camera.zoom(2))
-    assert len(list(own_cache.rglob("*.png"))) == 2
-    for path in own_cache.rglob("*.png"):
+    assert len(list(cache.rglob("*.png"))) == 2
+    for path in cache.rglob("*.png"):
         path.write_bytes(b"damaged")
     again = load(options(points=8)).train[0]
     assert torch.equal(again.source.image(again.camera), picture)
 
 
-def test_kept_pictures_are_used(own_cache, monkeypatch):
+def test_kept_pictures_are_used(cache, monkeypatch):
     first = load(options(points=8)).train[0]
     picture = first.source.image(first.camera)
     monkeypatch.setattr("gsx.scenes.demo.views.render", lambda *_: pytest.fail("rendered again"))
@@ -482,7 +475,7 @@ def test_kept_pictures_are_used(own_cache, monkeypatch):
     assert torch.equal(again.source.image(again.camera), picture)
 
 
-def test_other_samples_are_other_pictures(own_cache):
+def test_other_samples_are_other_pictures(cache):
     pictures = [load(options(points=8, samples=samples)).train[0].image() for samples in (1, 5)]
     assert not torch.equal(*pictures)
 
@@ -498,17 +491,13 @@ def test_a_cache_that_cannot_be_written_only_costs_time(tmp_path, monkeypatch, c
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"width": 0}, r"scene\.width=0"),
-        ({"train_views": 1}, r"scene\.train_views=1"),
-        ({"samples": 0}, r"scene\.samples=0"),
-        ({"downscale": 0}, r"scene\.downscale=0"),
         ({"test_views": 9}, r"scene\.test_views=9"),
-        ({"background": [0.5, 2.0, 0.0]}, r"scene\.background"),
+        ({"background": [0.5, 0.0]}, r"scene\.background"),
         *(({"split": f"every:{word}"}, r"scene\.split is 'every:") for word in ("0", "-1", "nan", "8" * 5000)),
         ({"split": "evry:8"}, r"scene\.split is 'evry:8', use one of .*Did you mean 'every:K'"),
     ],
 )
-def test_impossible_counts_are_refused(changes, words):
+def test_options_that_make_no_scene_are_refused(changes, words):
     with pytest.raises(ConfigError, match=words):
         load(options(**changes))
 

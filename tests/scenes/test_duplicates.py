@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from refusals import refused
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
@@ -87,5 +88,4 @@ def test_files_as_short_as_a_block_are_compared(tmp_path: Path) -> None:
 
 def test_a_photo_that_vanishes_is_a_sentence(tmp_path: Path) -> None:
     gone = tmp_path / "gone.png"
-    with pytest.raises(InputError, match=r"Image '.*gone\.png' cannot be read \(No such file or directory\): restore"):
-        alike(([gone], [gone]), size)
+    refused(r"Image '.*gone\.png' cannot be read \(No such file or directory\): restore", alike, ([gone], [gone]), size)

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 
 import gsx
 from gsx.core.data.camera import look_at
@@ -174,8 +175,7 @@ def test_masks_of_another_shape_are_refused(tmp_path):
     write_scene(synthesize(frames=3), tmp_path)
     for photo in sorted((tmp_path / "images").rglob("*.*")):
         stored_mask(tmp_path / "masks" / f"{photo.relative_to(tmp_path / 'images')}.png", [], (64, 48))
-    with pytest.raises(InputError, match=r"The mask '.*' is 48 x 64 and its photo 64 x 48: give it the photo's"):
-        trained(tmp_path, tmp_path / "run")
+    refused(r"The mask '.*' is 48 x 64 and its photo 64 x 48: give it the photo's", trained, tmp_path, tmp_path / "run")
 
 
 def test_alpha_of_opaque_photographs_is_told(tmp_path):
@@ -227,8 +227,7 @@ def test_what_is_masked_changes_nothing(capture, tmp_path):
 def test_masks_that_belong_to_nothing_are_told(tmp_path):
     write_scene(synthesize(frames=3), tmp_path)
     stored_mask(tmp_path / "masks" / "other.png", [(0, 0)])
-    with pytest.raises(InputError, match=r"None of the masks .*a\.jpg\.png.*scene\.masks=none"):
-        trained(tmp_path, tmp_path / "run")
+    refused(r"None of the masks .*a\.jpg\.png.*scene\.masks=none", trained, tmp_path, tmp_path / "run")
     with pytest.raises(ConfigError, match=r"scene\.masks is 'alfa'.*alpha"):
         trained(tmp_path, tmp_path / "run", "scene.masks=alfa")
 
@@ -240,5 +239,4 @@ def test_a_mask_that_leaves_nothing_is_told(tmp_path):
         mask = tmp_path / "masks" / f"{photo.relative_to(tmp_path / 'images')}.png"
         mask.parent.mkdir(parents=True, exist_ok=True)
         write_image(mask, black)
-    with pytest.raises(InputError, match="leaves nothing of"):
-        trained(tmp_path, tmp_path / "run")
+    refused("leaves nothing of", trained, tmp_path, tmp_path / "run")

@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from refusals import refused
 from small_scene import small_scene, spread
 from synthetic_colmap import synthesize, write_photos, write_scene
 
@@ -17,7 +18,6 @@ from gsx.builtin import plugins
 from gsx.core.data.camera import look_at
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene
-from gsx.core.errors import InputError
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.formats.origin import NO_ORIGIN, chosen_origin, comment_of, origin_of_positions, stated_in
@@ -27,11 +27,6 @@ from gsx.scenes.origin import around_origin, origin_of, point_looked_at
 UTM = (500_000.0, 5_400_000.0, 300.0)
 ECEF = (4_075_580.5, 931_853.25, 4_801_568.125)
 NOWHERE = (0.0, 0.0, 0.0)
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
 
 
 def moved_model(offset: tuple[float, float, float]) -> Any:
@@ -220,6 +215,5 @@ def test_adjustment_finds_cameras_whose_turns_text_has_rounded(tmp_path: Path) -
     for name in ("frames.txt", "rigs.txt"):
         (model / name).unlink(missing_ok=True)
     rounded_poses(model / "images.txt")
-    with pytest.raises(InputError, match=r"scene\.adjust=auto finds them anew"):
-        loaded(tmp_path, words)
+    refused(r"scene\.adjust=auto finds them anew", loaded, tmp_path, words)
     torch.testing.assert_close(positions(loaded(tmp_path, words, "scene.adjust=auto"))[0], exact, atol=0.01, rtol=0)

@@ -1,4 +1,4 @@
-"""What the loaders of photographs with poses share."""
+"""What files of poses share."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gsx.core.errors import InputError
-from gsx.scenes.posed import refuse_partial
+from gsx.scenes.pose_files import refuse_partial
 
 
 @pytest.mark.parametrize("count", [1, 3, 7, 100, 311])

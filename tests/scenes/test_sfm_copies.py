@@ -11,9 +11,9 @@ import pycolmap
 import pytest
 import torch
 from photo_files import lossless_webp, write_pixels, write_webp_with_exif
+from refusals import refused
 
 from gsx.core.data.images import image_size, read_image, write_image
-from gsx.core.errors import InputError
 from gsx.scenes import sfm_copies
 from gsx.scenes.exif import lens_of
 from gsx.scenes.orientation import oriented
@@ -219,10 +219,8 @@ def test_photos_that_cannot_be_read_are_named_with_reason_and_remedy(
     tmp_path: Path, name: str, write: Callable[[Path], None], said: str
 ) -> None:
     write(tmp_path / name)
-    with pytest.raises(InputError, match=said):
-        readable_size(tmp_path / name)
-    with pytest.raises(InputError, match=f"Only 0 of the 1 photos.*: export them again .*({said})"):
-        readable_sizes(tmp_path, [name])
+    refused(said, readable_size, tmp_path / name)
+    refused(f"Only 0 of the 1 photos.*: export them again .*({said})", readable_sizes, tmp_path, [name])
 
 
 def test_tiled_photos_are_read(tmp_path: Path) -> None:
@@ -245,5 +243,4 @@ def test_kinds_that_nothing_reads_are_counted_with_their_remedies(tmp_path: Path
     ]  # fmt: skip
     for name in ("a.png", "b.png"):
         (tmp_path / name).unlink()
-    with pytest.raises(InputError, match=r"0 photos in other formats, and 1 AVIF photos, .* 2 raw photos, .*export"):
-        find_photos(tmp_path)
+    refused(r"0 photos in other formats, and 1 AVIF photos, .* 2 raw photos, .*export", find_photos, tmp_path)

@@ -1,9 +1,9 @@
-"""Poses, intrinsics and points of a COLMAP model anew from its own observations, where these contradict it.
+"""Bundle adjustment of a COLMAP model by its own observations, where these contradict it.
 
 The cameras of a model that another program wrote, or that was put together by hand, may miss what they observed by the
-same movement everywhere in a picture: a wrong pose, focal length or lens. That is told apart from what each keypoint is
-off by on its own: a movement fitted to every other keypoint of an image has to explain those in between. COLMAP's
-bundle adjustment then moves cameras and points to where they explain the observations best.
+same movement everywhere in a picture: a wrong pose, focal length or lens. What each keypoint is off by on its own
+differs: a movement fitted to every other keypoint of an image has to explain those in between. COLMAP's bundle
+adjustment then moves cameras and points to where they explain the observations best.
 
 A model that learns from the photographs cannot do this: it takes a wrong lens in, by points at wrong depths, and no
 photograph contradicts it.
@@ -24,7 +24,8 @@ from gsx.core.errors import InputError
 from gsx.core.shapes import Float
 from gsx.engine.cache import cache_folder, content_key, file_stamp
 from gsx.formats.origin import Origin, chosen_origin
-from gsx.scenes.colmap_model import Model, ModelImage, present_files, read_model, reconstruction_of
+from gsx.scenes.colmap_folders import model_files
+from gsx.scenes.colmap_model import Model, ModelImage, read_model, reconstruction_of
 from gsx.scenes.kept_models import kept_model
 from gsx.scenes.observations import known, straight_keypoints, unmeasured
 from gsx.scenes.sfm import quiet
@@ -36,7 +37,7 @@ WHEN = ("never", "auto", "always")
 METHOD = "adjusted/2"
 """Part of the cache key: raise the number when the adjustment changes."""
 LEAST = 32
-"""Observations of an image that tell its movement."""
+"""Observations of an image from which its movement is estimated."""
 SHIFT = 0.25
 """Px of the model's cameras, root of the mean square, from which on movements of whole pictures are wrong cameras."""
 FLAT = 1e3
@@ -46,7 +47,7 @@ BENT = {"PINHOLE": "OPENCV", "SIMPLE_PINHOLE": "SIMPLE_RADIAL"}
 
 
 def adjusted(model: Model, when: str) -> tuple[Model, list[str]]:
-    """(the model, adjusted where that is wanted, a note that says so).
+    """Return the model, adjusted as `scene.adjust` says, and a note on that.
 
     Raises:
         InputError: a file of it is missing, or nothing could be solved.
@@ -55,65 +56,65 @@ def adjusted(model: Model, when: str) -> tuple[Model, list[str]]:
         return model, []
     before = shift_of(model)
     if when == "auto" and not (before is not None and before > SHIFT):
-        return model, [f"Nothing is adjusted: {fit_told(before)}{unmeasured(model)} (scene.adjust=auto)."]
-    stamps = [file_stamp(file) for file in present_files(model.folder)]
-    key = content_key(METHOD, installed(), str(model.folder.resolve()), stamps)
+        return model, [f"Nothing is adjusted: {fit_words(before)}{unmeasured(model)} (scene.adjust=auto)."]
+    stamps = [file_stamp(file) for file in model_files(model.folder).values()]
+    key = content_key(METHOD, colmap_version(), str(model.folder.resolve()), stamps)
     after = read_model(kept_model(cache_folder("adjusted", key), lambda work: bundle_adjusted(model.folder)))
     return after, [
         *(note for note in model.notes if note not in after.notes),
-        f"Bundle adjustment of poses, intrinsics and points (scene.adjust={when}): before it {fit_told(before)}, then "
-        f"{fit_told(shift_of(after))}{unmeasured(after)}{lenses_told(model, after)}.",
+        f"Bundle adjustment of poses, intrinsics and points (scene.adjust={when}): before it {fit_words(before)}, then "
+        f"{fit_words(shift_of(after))}{unmeasured(after)}{lens_words(model, after)}.",
     ]
 
 
-def fit_told(shift: float | None) -> str:
-    """How cameras fit what they observed, in words."""
+def fit_words(shift: float | None) -> str:
+    """Return how cameras fit what they observed, in words."""
     return "too few observations tell" if shift is None else f"pictures lie {shift:.2f} px beside what cameras observed"
 
 
 def fit_line(model: Model) -> str:
-    """The same of a model, with what to do about it."""
+    """Return how a model's cameras fit, with what to do about it."""
     try:
         shift, rest = shift_of(model), unmeasured(model)
     except InputError as problem:  # of a lens
         return str(problem)
     wrong = shift is not None and shift > SHIFT
-    return fit_told(shift) + str(rest) + (": scene.adjust=auto finds poses and intrinsics anew" if wrong else "")
+    return fit_words(shift) + str(rest) + (": scene.adjust=auto finds poses and intrinsics anew" if wrong else "")
 
 
-def installed() -> str:
-    """The version of COLMAP."""
+def colmap_version() -> str:
+    """Return the version of COLMAP."""
     import pycolmap
 
     return str(pycolmap.__version__)
 
 
-def lenses_told(before: Model, after: Model) -> str:
-    """By how much focal lengths have changed, and which distortion was found, in words."""
-    ratios = [
-        after.cameras[number].mean_focal_length() / camera.mean_focal_length()
-        for number, camera in before.cameras.items()
-    ]
+def lens_words(before: Model, after: Model) -> str:
+    """Return by how much focal lengths have changed, and how many lenses were bent, in words."""
+    pairs = [(camera, after.cameras[number]) for number, camera in before.cameras.items()]
+    ratios = [new.mean_focal_length() / old.mean_focal_length() for old, new in pairs]
     low, high = min(ratios), max(ratios)
-    bent = sum(after.cameras[number].model_name != camera.model_name for number, camera in before.cameras.items())
-    told = f"; focal lengths times {low:.4f}" + (f" to {high:.4f}" if high - low > 1e-4 else "")
-    return told + (f", lenses of {bent} cameras were bent" if bent else "")
+    bent = sum(new.model_name != old.model_name for old, new in pairs)
+    words = f"; focal lengths times {low:.4f}" + (f" to {high:.4f}" if high - low > 1e-4 else "")
+    return words + (f", lenses of {bent} cameras were bent" if bent else "")
 
 
 # -- do cameras fit what they observed? --------------------------------------------------------------------------------
 
 
 def shift_of(model: Model) -> float | None:
-    """Px of the model's cameras by which movements of whole pictures put points beside where they were observed: root
-    of the mean square over images; None where none tells."""
+    """Return how far movements of whole pictures put points beside where they were observed, px of the model's cameras:
+    root of the mean square over images; None where none has enough observations."""
     squares = [explained(image, model.cameras[image.camera_id]) for image in model.images]
     finite = [square for square in squares if square is not None and math.isfinite(square)]
     return math.sqrt(max(0.0, sum(finite) / len(finite))) if finite else None
 
 
 def explained(image: ModelImage, intrinsics: Any) -> float | None:
-    """Mean square of the movement that half the keypoints of an image tell of the other half, px; may be negative where
-    they contradict each other. None: too few."""
+    """Return the mean square of the movement that half the keypoints of an image predict for the other half, px.
+
+    It is negative where they contradict each other; None: too few.
+    """
     pinhole, observed = pinhole_of(intrinsics), straight_keypoints(image, intrinsics)
     points = image.observed @ image.rotation.T + image.translation
     usable = (points[:, 2] > 0) & (points[:, :2].abs() <= FLAT * points[:, 2:]).all(1) & known(observed)
@@ -124,24 +125,24 @@ def explained(image: ModelImage, intrinsics: Any) -> float | None:
     centre = observed.new_tensor([pinhole.principal_point_x, pinhole.principal_point_y])
     off = (observed[usable] - centre) / focal - torch.stack([x / z, y / z], 1)
     columns = movements(x / z, y / z, z)
-    told = [told_of(columns, off, slice(start, None, 2), slice(1 - start, None, 2)) for start in range(2)]
-    return float(focal.square().mean()) * sum(told) / len(told)
+    products = [predicted(columns, off, slice(start, None, 2), slice(1 - start, None, 2)) for start in range(2)]
+    return float(focal.square().mean()) * sum(products) / len(products)
 
 
 def movements(x: Float[Tensor, "K"], y: Float[Tensor, "K"], z: Float[Tensor, "K"]) -> Float[Tensor, "K 2 8"]:
-    """How directions move with a turn about each axis, a step along each, the focal length, and radial distortion."""
+    """Return how directions move by a turn about each axis, a step along each, the focal length, radial distortion."""
     none, one, squared = torch.zeros_like(x), torch.ones_like(x), x * x + y * y
     across = [-x * y, 1 + x * x, -y, one / z, none, -x / z, x, x * squared]
     down = [-1 - y * y, x * y, x, none, one / z, -y / z, y, y * squared]
     return torch.stack([torch.stack(across, -1), torch.stack(down, -1)], 1)
 
 
-def told_of(columns: Float[Tensor, "K 2 8"], off: Float[Tensor, "K 2"], own: slice, other: slice) -> float:
-    """Mean product of what other observations are off by and what the movement of some says that they are."""
+def predicted(columns: Float[Tensor, "K 2 8"], off: Float[Tensor, "K 2"], fitted: slice, other: slice) -> float:
+    """Return the mean product of what other observations are off by and what the movement fitted to some predicts."""
     squares = off.square().sum(1)
     weights = 1 / (1 + squares / squares.median().clamp_min(1e-18))
-    weighted = (columns[own] * weights[own, None, None]).flatten(0, 1).T
-    system, right = weighted @ columns[own].flatten(0, 1), weighted @ off[own].flatten()
+    weighted = (columns[fitted] * weights[fitted, None, None]).flatten(0, 1).T
+    system, right = weighted @ columns[fitted].flatten(0, 1), weighted @ off[fitted].flatten()
     scale = system.diagonal().sqrt().clamp_min(1e-12)
     held = system / scale / scale[:, None] + 1e-6 * torch.eye(len(scale), dtype=scale.dtype)
     movement = torch.linalg.solve(held, right / scale) / scale
@@ -153,52 +154,61 @@ def told_of(columns: Float[Tensor, "K 2 8"], off: Float[Tensor, "K 2"], own: sli
 
 
 def bundle_adjusted(folder: Path) -> Any:
-    """The pycolmap.Reconstruction of a folder with cameras and points moved; cameras without distortion get some where
-    that moves what they observed.
+    """Return the pycolmap.Reconstruction of a folder with cameras and points moved.
+
+    Cameras without distortion get some where that moves what they observed.
 
     Raises:
         InputError: nothing could be solved.
     """
-    found, *_ = reconstruction_of(folder)
-    if not found.num_points3D():
+    model, *_ = reconstruction_of(folder)
+    if not model.num_points3D():
         raise InputError(f"{folder} keeps no observations to adjust cameras by: set scene.adjust=never.")
-    forget_removed_points(found)
-    logger.info("bundle adjustment of %d images and %d points", found.num_reg_images(), found.num_points3D())
-    x, y, z = origin = model_origin(found)
-    local = shifted(found, (-x, -y, -z))
+    forget_removed_points(model)
+    logger.info("bundle adjustment of %d images and %d points", model.num_reg_images(), model.num_points3D())
+    x, y, z = origin = model_origin(model)
+    move(model, (-x, -y, -z))
     if any(origin):
-        place_cameras(local)
-    return shifted(bent_where_needed(local, folder), origin)
+        place_cameras(model)
+    return move(bent_where_needed(model, folder), origin)
 
 
-def model_origin(reconstruction: Any) -> Origin:
+def model_origin(model: Any) -> Origin:
     """Return the origin around which a model is adjusted: far from it, turning a camera moves everything it sees."""
-    images = [reconstruction.image(number) for number in reconstruction.reg_image_ids()]
-    centres = torch.from_numpy(np.array([image.projection_center() for image in images]))
+    centres = torch.from_numpy(np.array([image.projection_center() for image in registered(model)]))
     middle = centres.median(0).values
     return chosen_origin(middle, float((centres - middle).norm(dim=1).mean()))
 
 
-def shifted(reconstruction: Any, by: Origin) -> Any:
-    """Return a model whose cameras and points are moved in place."""
+def registered(model: Any) -> list[Any]:
+    """Return the images of a pycolmap.Reconstruction that have a pose."""
+    return [model.image(number) for number in model.reg_image_ids()]
+
+
+def observed_pixels(image: Any) -> Float[np.ndarray, "K 2"]:
+    """Return the keypoints of a pycolmap image that observe points."""
+    return np.array([image.point2D(index).xy for index in image.get_observation_point2D_idxs()]).reshape(-1, 2)
+
+
+def move(model: Any, by: Origin) -> Any:
+    """Move cameras and points of a model in place, and return it."""
     import pycolmap
 
     if any(by):
-        reconstruction.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(by)))
-    return reconstruction
+        model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array(by)))
+    return model
 
 
-def place_cameras(reconstruction: Any) -> None:
+def place_cameras(model: Any) -> None:
     """Put each camera where its observations say, as it is turned.
 
     A model far from (0, 0, 0) states its cameras by rotation and translation: a rotation that text has rounded to six
     digits puts a camera of UTM coordinates metres away.
     """
-    for number in reconstruction.reg_image_ids():
-        image = reconstruction.image(number)
-        observed = [image.point2D(index) for index in image.get_observation_point2D_idxs()]
-        rays = image.camera.cam_from_img(np.array([point.xy for point in observed]).reshape(-1, 2))
-        points = np.array([reconstruction.point3D(point.point3D_id).xyz for point in observed]).reshape(-1, 3)
+    for image in registered(model):
+        rays = image.camera.cam_from_img(observed_pixels(image))
+        ids = [image.point2D(index).point3D_id for index in image.get_observation_point2D_idxs()]
+        points = np.array([model.point3D(number).xyz for number in ids]).reshape(-1, 3)
         measured = np.isfinite(rays).all(1)
         pose = image.cam_from_world()
         translation = translation_from(rays[measured], points[measured] @ pose.rotation.matrix().T)
@@ -214,30 +224,30 @@ def translation_from(rays: Float[np.ndarray, "K 2"], turned: Float[np.ndarray, "
     rows = np.zeros((len(rays), 2, 3))
     rows[:, 0, 0], rows[:, 1, 1], rows[:, :, 2] = 1, 1, -rays
     right = rays * turned[:, 2:] - turned[:, :2]
-    found: np.ndarray = np.linalg.lstsq(rows.reshape(-1, 3), right.ravel(), rcond=None)[0]
-    return found
+    translation: np.ndarray = np.linalg.lstsq(rows.reshape(-1, 3), right.ravel(), rcond=None)[0]
+    return translation
 
 
-def bent_where_needed(found: Any, folder: Path) -> Any:
-    """Return an adjusted model, in which cameras without distortion have some where that moves what they observed."""
-    adjust(found, folder)
-    straight = [number for number, camera in found.cameras.items() if camera.model_name in BENT]
+def bent_where_needed(model: Any, folder: Path) -> Any:
+    """Adjust a model, or a copy in which cameras without distortion have some where that moves what they observed."""
+    adjust(model, folder)
+    straight = [number for number, camera in model.cameras.items() if camera.model_name in BENT]
     if not straight:
-        return found
-    bent = with_distortion(found, straight)
+        return model
+    bent = with_distortion(model, straight)
     adjust(bent, folder)
-    return bent if bend_of(bent, straight) > SHIFT else found
+    return bent if bend_of(bent, straight) > SHIFT else model
 
 
-def forget_removed_points(reconstruction: Any) -> None:
-    """Remove observations of points that the reconstruction lacks, which a bundle adjustment does not take."""
-    for image in reconstruction.images.values():
+def forget_removed_points(model: Any) -> None:
+    """Remove observations of points that the model lacks, which a bundle adjustment does not take."""
+    for image in model.images.values():
         for index in image.get_observation_point2D_idxs():
-            if not reconstruction.exists_point3D(image.point2D(index).point3D_id):
+            if not model.exists_point3D(image.point2D(index).point3D_id):
                 image.reset_point3D_for_point2D(index)
 
 
-def adjust(reconstruction: Any, folder: Path) -> None:
+def adjust(model: Any, folder: Path) -> None:
     """Move cameras, focal lengths, distortion and points; on one thread, so that the bits are the same each time.
 
     Raises:
@@ -249,29 +259,26 @@ def adjust(reconstruction: Any, folder: Path) -> None:
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY  # some observations are of something else
     options.ceres.solver_options.num_threads = 1
-    for number in reconstruction.reg_image_ids():
+    for number in model.reg_image_ids():
         config.add_image(number)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    remedy = "set scene.adjust=never, or reconstruct the photos with scene=photos"
     try:
         with quiet():
-            summary = pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+            summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     except (ValueError, RuntimeError) as problem:
         raise InputError(
-            f"COLMAP refuses a bundle adjustment of {folder} ({str(problem).strip()}): set scene.adjust=never, or "
-            "reconstruct the photos with scene=photos."
+            f"COLMAP refuses a bundle adjustment of {folder} ({str(problem).strip()}): {remedy}."
         ) from None
     if not summary.is_solution_usable():
-        raise InputError(
-            f"The bundle adjustment of {folder} came to nothing ({summary.brief_report()}): set scene.adjust=never, or "
-            "reconstruct the photos with scene=photos."
-        )
+        raise InputError(f"The bundle adjustment of {folder} came to nothing ({summary.brief_report()}): {remedy}.")
 
 
-def with_distortion(reconstruction: Any, straight: Sequence[int]) -> Any:
-    """A copy in which cameras of these numbers, which have no distortion, could have some."""
+def with_distortion(model: Any, straight: Sequence[int]) -> Any:
+    """Return a copy in which cameras of these numbers, which have no distortion, could have some."""
     import pycolmap
 
-    out = copy.deepcopy(reconstruction)
+    out = copy.deepcopy(model)
     for camera in (out.cameras[number] for number in straight):
         wider = pycolmap.Camera.create_from_model_name(
             camera.camera_id, BENT[camera.model_name], 1.0, camera.width, camera.height
@@ -281,17 +288,15 @@ def with_distortion(reconstruction: Any, straight: Sequence[int]) -> Any:
     return out
 
 
-def bend_of(reconstruction: Any, cameras: Sequence[int]) -> float:
-    """Px by which distortion moves what cameras of these numbers observed, root of the mean square."""
+def bend_of(model: Any, cameras: Sequence[int]) -> float:
+    """Return by how many px distortion moves what these cameras observed, root of the mean square."""
     squares = [np.zeros(0)]
-    for image in (reconstruction.image(number) for number in reconstruction.reg_image_ids()):
-        if image.camera_id not in cameras:
-            continue
-        camera = reconstruction.cameras[image.camera_id]
-        seen = np.array([image.point2D(index).xy for index in image.get_observation_point2D_idxs()]).reshape(-1, 2)
-        focal = np.array([camera.focal_length_x, camera.focal_length_y])
-        straight = camera.cam_from_img(seen) * focal + [camera.principal_point_x, camera.principal_point_y]
-        squares.append(np.square(straight - seen).sum(1))
+    for image in registered(model):
+        if image.camera_id in cameras:
+            camera, pixels = model.cameras[image.camera_id], observed_pixels(image)
+            focal = np.array([camera.focal_length_x, camera.focal_length_y])
+            straight = camera.cam_from_img(pixels) * focal + [camera.principal_point_x, camera.principal_point_y]
+            squares.append(np.square(straight - pixels).sum(1))
     moved = np.concatenate(squares)
     moved = moved[np.isfinite(moved)]  # a lens may have no ray for a keypoint
     return float(np.sqrt(moved.mean())) if len(moved) else 0.0

@@ -21,25 +21,16 @@ from gsx.core.files import at_home
 from gsx.core.ranges import Length, Points, Range, Seed
 from gsx.core.shapes import UInt8
 from gsx.formats.origin import in_words
-from gsx.scenes.duplicates import photos_of, refuse_shared
+from gsx.scenes.duplicates import photos_of
 from gsx.scenes.frame_files import TEST_FILES, TRAIN_FILE, is_empty, needs_lens, test_file
-from gsx.scenes.frame_names import plain_name
 from gsx.scenes.lenses import angle_of, beyond_angle, states_lens
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.origin import origin_of_cameras, point_looked_at
-from gsx.scenes.points import random_points, read_points
-from gsx.scenes.posed import (
-    Shot,
-    frames_line,
-    pose_from_opengl,
-    present_frames,
-    provenance,
-    read_frames,
-    reduction_of,
-    refuse_too_few,
-    views_of,
-)
+from gsx.scenes.photo_names import plain_name
+from gsx.scenes.points import random_points, stored_points
+from gsx.scenes.pose_files import frames_line, pose_from_opengl, present_frames, read_frames
+from gsx.scenes.posed import Shot, check_sides, scene_of, views_of
 from gsx.scenes.splits import short, split_names
 
 POINTS_FILE = "points3d.ply"  # where 3D-GS caches its random cloud, and conversions put a real one
@@ -62,9 +53,10 @@ class BlenderOptions(SceneOptions):
     scales: Annotated[list[int], Range(1, 64)] = field(default_factory=lambda: [1])
     """Factors by which training images are reduced, each a set of views; a factor given twice is trained on twice."""
     test_scales: Annotated[list[int], Range(1, 64)] = field(default_factory=lambda: [1])
-    """The same of test images."""
+    """Factors by which test images are reduced."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("scales", "test_scales"):
             if not getattr(self, name):
                 raise ValueError(f"scene.{name} is empty; give whole factors of reduction, 1 or more")
@@ -82,43 +74,36 @@ def load(options: BlenderOptions) -> Scene:
     """
     folder = at_home(options.path)
     train_file, held_out = folder / TRAIN_FILE, _test_file(folder, options.split)
-    train_shots, train_notes = read_shots(train_file, options.missing)
+    train_shots, notes = read_shots(train_file, options.missing)
     test_shots, test_notes = read_shots(held_out, options.missing) if held_out else ([], [])
     views = views_of([*train_shots, *test_shots], options)  # together, so that they share one cache
-    train, test = _split(views, len(train_shots), options.split, folder)
-    refuse_too_few(train, train_file)
-    refuse_shared(train, test, held_out or train_file)
-    grouped = list(options.test_scales) != [1]
-    train = [reduced(view, factor) for factor in options.scales for view in train]
-    test = [reduced(view, factor, grouped) for factor in options.test_scales for view in test]
+    sides = _split(views, len(train_shots), options.split, folder)
+    check_sides(sides, held_out or train_file)
     points, points_note = _points(options, folder, [view.camera for view in views])
-    return Scene(
-        name=folder.resolve().name,
+    notes = [*notes, *test_notes, *_test_note(held_out, options.split), *mask_notes(views, options), points_note]
+    details = {"test_file": held_out.name if held_out else None, "points": options.points}
+    return at_scales(scene_of(options, folder, views, sides, points, notes, details), options)
+
+
+def at_scales(scene: Scene, options: BlenderOptions) -> Scene:
+    """Return the scene with each view at each of its scales; for whole images alone, the protocol keeps its hash."""
+    scales, test_scales = list(options.scales), list(options.test_scales)
+    if scales == test_scales == [1]:
+        return scene
+    grouped = test_scales != [1]
+    train = [reduced(view, factor) for factor in scales for view in scene.train]
+    return replace(
+        scene,
         train=train,
-        test=test,
-        points=points,
-        background=torch.tensor(list(options.background), dtype=torch.float32),
-        reduction=Reduction() if list(options.scales) != [1] else reduction_of(options),
+        test=[reduced(view, factor, grouped) for factor in test_scales for view in scene.test],
         extent=extent_of([view.camera for view in train]),
-        notes=[
-            *train_notes,
-            *test_notes,
-            *_test_note(held_out, options.split),
-            *mask_notes(views, options),
-            points_note,
-        ],
-        provenance=provenance(
-            options,
-            views,
-            test_file=held_out.name if held_out else None,
-            points=options.points,
-            **_scales_named(options),
-        ),
+        reduction=Reduction() if scales != [1] else scene.reduction,
+        provenance=scene.provenance | {"scales": scales, "test_scales": test_scales},
     )
 
 
 def reduced(view: View, factor: int, grouped: bool = False) -> View:
-    """The view of an image `factor` times smaller, box-averaged before it is composited (Mip-Splatting).
+    """Return the view of an image `factor` times smaller, box-averaged before it is composited (Mip-Splatting).
 
     Raises:
         ConfigError: the view is reduced already.
@@ -143,32 +128,21 @@ def reduced(view: View, factor: int, grouped: bool = False) -> View:
 
 @dataclass(frozen=True)
 class BoxAverage:
-    """`box_averaged` as what is done to a decoded file; equal factors are one reduction, whose pictures are shared."""
+    """Means of factor x factor pixels of each channel, straight alpha among them, truncated to 8 bits (Mip-Splatting).
+
+    Three 2 x 2 averages of floats in a row are one over 8 x 8; here it is exact. Equal factors share their pictures.
+    """
 
     factor: int
 
     def __call__(self, image: UInt8[Tensor, "C H W"]) -> UInt8[Tensor, "C height width"]:
-        return box_averaged(image, self.factor)
-
-
-def box_averaged(image: UInt8[Tensor, "C H W"], factor: int) -> UInt8[Tensor, "C height width"]:
-    """Means of factor x factor pixels of each channel, straight alpha among them, truncated to 8 bits (Mip-Splatting).
-
-    Three 2 x 2 averages of floats in a row are one over 8 x 8; here it is exact.
-    """
-    channels, height, width = image.shape
-    blocks = image.reshape(channels, height // factor, factor, width // factor, factor)
-    return (blocks.sum((2, 4)) // factor**2).to(torch.uint8)
-
-
-def _scales_named(options: BlenderOptions) -> dict[str, Any]:
-    """For the provenance; nothing for whole images alone, so that their protocol keeps its hash."""
-    scales = {"scales": list(options.scales), "test_scales": list(options.test_scales)}
-    return {} if scales == {"scales": [1], "test_scales": [1]} else scales
+        channels, height, width = image.shape
+        blocks = image.reshape(channels, height // self.factor, self.factor, width // self.factor, self.factor)
+        return (blocks.sum((2, 4)) // self.factor**2).to(torch.uint8)
 
 
 def read_shots(file: Path, missing: float) -> tuple[list[Shot], list[str]]:
-    """The shots of one transforms file, in its order, and a note where photos are missing.
+    """Return the shots of one transforms file, in its order, and notes on missing photos and unused keys.
 
     Raises:
         InputError: the file is missing or damaged, or too few of its photos are there.
@@ -195,8 +169,7 @@ def _shot(frame: dict[str, Any], photo: Path, fov_x: float, file: Path) -> Shot:
     name = plain_name(frame["file_path"])
     rotation, translation = pose_from_opengl(frame.get("transform_matrix"), f"Frame '{name}' of '{file}'")
     width, height = image_size(photo)
-    focal = width / (2 * math.tan(fov_x / 2))
-    whole = pinhole(rotation, translation, focal, width, height)
+    whole = pinhole(rotation, translation, width / (2 * math.tan(fov_x / 2)), width, height)
     return Shot(name=name, photo=photo, whole=whole, expected_size=(width, height))
 
 
@@ -207,17 +180,17 @@ def _test_file(folder: Path, rule: str) -> Path | None:
         ConfigError: the files hold the split, and the rule is another one.
         InputError: they should, and do not.
     """
-    found = test_file(folder)
-    if found is None and rule == "json":
+    file = test_file(folder)
+    if file is None and rule == "json":
         raise InputError(
             f"'{folder}' has neither {' nor '.join(TEST_FILES)} with frames: hold out training "
             "images with scene.split=every:8, or none with scene.split=none."
         )
-    if found is not None and rule not in ("json", "none"):
+    if file is not None and rule not in ("json", "none"):
         raise ConfigError(
             f"scene.split is '{short(rule)}', but transforms_*.json hold the split: use json, or none to train on all."
         )
-    return found
+    return file
 
 
 def _split(views: Sequence[View], count: int, rule: str, folder: Path) -> tuple[list[View], list[View]]:
@@ -229,28 +202,28 @@ def _split(views: Sequence[View], count: int, rule: str, folder: Path) -> tuple[
 
 
 def _test_note(file: Path | None, rule: str) -> list[str]:
-    val = file is not None and not file.stem.endswith("test") and rule == "json"
-    return [f"Test views are those of {file.name}: there is no test file."] if file is not None and val else []
+    validation = file is not None and not file.stem.endswith("test") and rule == "json"
+    return [f"Test views are those of {file.name}: there is no test file."] if file and validation else []
 
 
 def _points(options: BlenderOptions, folder: Path, cameras: Sequence[Camera]) -> tuple[PointCloud, str]:
-    """Points and a note on where they come from; random ones lie about (0, 0, 0), or about what far cameras look at."""
-    stored = folder / (POINTS_FILE if options.points == "auto" else options.points)
-    if options.points == "random" or (options.points == "auto" and not stored.is_file()):
-        corner = torch.full((3,), options.points_bound, dtype=torch.float64)
-        generator = torch.Generator().manual_seed(options.seed)
-        far = any(origin_of_cameras(cameras, options.points_bound))
-        middle = point_looked_at(cameras) if far else torch.zeros_like(corner)
-        cloud = random_points(options.random_points, middle - corner, middle + corner, generator)
-        about = f" about {in_words(middle.round(decimals=3).tolist())}, which the cameras look at" if far else ""
-        cube = f"[-{options.points_bound}, {options.points_bound}]^3{about}"
-        return cloud, f"Starts from {len(cloud)} random points in {cube}."
-    cloud = read_points(stored)
-    return cloud, f"Starts from the {len(cloud)} points of {stored.name}."
+    """Return points and their source; random ones lie about (0, 0, 0), or about what far cameras look at."""
+    auto = options.points == "auto"
+    name = POINTS_FILE if auto else options.points
+    if name != "random" and not (auto and not (folder / name).is_file()):
+        return stored_points(folder, name)
+    corner = torch.full((3,), options.points_bound, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(options.seed)
+    far = any(origin_of_cameras(cameras, options.points_bound))
+    middle = point_looked_at(cameras) if far else torch.zeros_like(corner)
+    cloud = random_points(options.random_points, middle - corner, middle + corner, generator)
+    about = f" about {in_words(middle.round(decimals=3).tolist())}, which the cameras look at" if far else ""
+    cube = f"[-{options.points_bound}, {options.points_bound}]^3{about}"
+    return cloud, f"Starts from {len(cloud)} random points in {cube}."
 
 
 def facts(path: Path) -> Iterator[str]:
-    """Images of every split."""
+    """Yield how many images of each transforms file are there."""
     return (frames_line(file) for file in sorted(path.glob("transforms_*.json")) if not is_empty(file))
 
 

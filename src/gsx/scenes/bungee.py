@@ -19,8 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera
-from gsx.core.data.images import checked_size
+from gsx.core.data.camera import Camera, pinhole
+from gsx.core.data.images import image_size, refuse_other_size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, InputError
@@ -29,20 +29,12 @@ from gsx.core.ranges import Points, Seed
 from gsx.core.shapes import Float
 from gsx.scenes import colmap
 from gsx.scenes.colmap_folders import model_folders
-from gsx.scenes.duplicates import photos_of, refuse_shared
+from gsx.scenes.duplicates import photos_of
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.origin import moved, origin_of_cameras
-from gsx.scenes.points import grey_points, read_points
-from gsx.scenes.posed import (
-    Shot,
-    finite_number,
-    pose_from_opengl,
-    provenance,
-    read_json,
-    reduction_of,
-    refuse_too_few,
-    views_of,
-)
+from gsx.scenes.points import grey_points, stored_points
+from gsx.scenes.pose_files import finite_number, pose_from_opengl, read_json
+from gsx.scenes.posed import Shot, check_sides, scene_of, views_of
 from gsx.scenes.splits import Split, positive, short, split_names
 
 POSES_FILE = "poses_enu.json"
@@ -56,7 +48,7 @@ RAYS_PER_POINT = 4  # some end in the sky
 
 @dataclass(frozen=True, kw_only=True)
 class BungeeOptions(colmap.ColmapOptions):
-    """What `conf/scene/bungee.yaml` sets.
+    """Options of `conf/scene/bungee.yaml`.
 
     `split` can be `lod:N` as well (Scaffold-GS): of the sorted images those up to number N are test and the rest
     train, or from N = 50 on the other way round.
@@ -70,7 +62,7 @@ class BungeeOptions(colmap.ColmapOptions):
 
 
 def load(options: BungeeOptions) -> Scene:
-    """Loads a BungeeNeRF scene.
+    """Load a BungeeNeRF scene.
 
     Raises:
         ConfigError: the split rule cannot be read.
@@ -86,22 +78,21 @@ def load(options: BungeeOptions) -> Scene:
         centre = torch.tensor([x, y, 0.0], dtype=torch.float64)
     groups, basis = _scales(scene.train, centre, folder, options.images)
     views = [replace(view, group=f"scale-{scale}") for view, scale in zip(scene.train, groups, strict=True)]
-    train, test = split_views([view.name for view in views], options.split, folder, photos_of(views))
-    train_views, test_views = ([views[i] for i in side] for side in (train, test))
-    refuse_too_few(train_views, folder)
-    refuse_shared(train_views, test_views, folder)
+    split = split_views([view.name for view in views], options.split, folder, photos_of(views))
+    train, test = ([views[i] for i in side] for side in split)
+    check_sides((train, test), folder)
     return replace(
         scene,
-        train=train_views,
-        test=test_views,
-        extent=extent_of([view.camera for view in train_views]),
+        train=train,
+        test=test,
+        extent=extent_of([view.camera for view in train]),
         notes=[*scene.notes, _scale_note(views, basis)],
         provenance={**scene.provenance, "format": options.name, "split": options.split, "scales": basis},
     )
 
 
 def split_views(names: Sequence[str], rule: str, folder: Path, photographs: Sequence[Path] = ()) -> Split:
-    """Positions of training and test names; `lod:N`, or any rule of `gsx.scenes.splits`. photographs: their files.
+    """Return positions of training and test names by `lod:N`, or any rule of `gsx.scenes.splits`.
 
     Raises:
         ConfigError: the rule cannot be read, or looks at photographs where there are none.
@@ -121,7 +112,7 @@ def split_views(names: Sequence[str], rule: str, folder: Path, photographs: Sequ
 
 
 def load_enu(options: BungeeOptions, folder: Path) -> Scene:
-    """The scene of `poses_enu.json`, all views in `train`.
+    """Return the scene of `poses_enu.json`, all views in `train`.
 
     Poses are OpenGL camera-to-world in scaled east-north-up coordinates with the ground at height 0.
 
@@ -134,31 +125,20 @@ def load_enu(options: BungeeOptions, folder: Path) -> Scene:
             f"'{folder}' has neither a COLMAP model nor {POSES_FILE}, set scene.path to a folder with one."
         )
     content = read_json(file)
-    poses = _poses(content, file)
-    photos = image_files(folder / options.images)
+    poses, photos = _poses(content, file), image_files(folder / options.images)
     if len(photos) != len(poses):
         raise InputError(
             f"'{file}' has {len(poses)} poses and '{folder / options.images}' {len(photos)} images: put back the"
             " images that belong to it."
         )
-    shots = [_shot(pose, photo, file) for pose, photo in zip(poses, photos, strict=True)]
-    views = views_of(shots, options)
+    views = views_of([_shot(pose, photo, file) for pose, photo in zip(poses, photos, strict=True)], options)
     points, note = _points(views, content, options, file)
-    return Scene(
-        name=folder.resolve().name,
-        train=views,
-        test=[],
-        points=points,
-        background=torch.tensor(list(options.background), dtype=torch.float32),
-        reduction=reduction_of(options),
-        extent=extent_of([view.camera for view in views]),
-        notes=[f"Cameras come from {POSES_FILE}.", *mask_notes(views, options), note],
-        provenance=provenance(options, views, points=options.points),
-    )
+    notes = [f"Cameras come from {POSES_FILE}.", *mask_notes(views, options), note]
+    return scene_of(options, folder, views, (views, []), points, notes, {"points": options.points})
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The images of a folder sorted by name, which is from near to far in the original data."""
+    """Return the images of a folder sorted by name, which is from near to far in the original data."""
     files = folder.iterdir() if folder.is_dir() else []
     return sorted(file for file in files if file.suffix.lower() in SUFFIXES)
 
@@ -181,27 +161,17 @@ def _shot(pose: Float[Tensor, "17"], photo: Path, file: Path) -> Shot:
     if min(height, width, focal) < 1:
         raise InputError(f"{place} has size {width:g} x {height:g} and focal length {focal:g}, copy the file anew.")
     expected = round(width), round(height)
-    camera = Camera(
-        rotation=rotation,
-        translation=translation,
-        fx=focal,
-        fy=focal,
-        cx=width / 2,
-        cy=height / 2,
-        width=expected[0],
-        height=expected[1],
-    )
-    whole = camera.resize(*checked_size(photo, expected))
-    return Shot(name=photo.name, photo=photo, whole=whole, expected_size=expected)
+    camera = replace(pinhole(rotation, translation, focal, *expected), cx=width / 2, cy=height / 2)
+    refuse_other_size(photo, size := image_size(photo), expected)
+    return Shot(name=photo.name, photo=photo, whole=camera.resize(*size), expected_size=expected)
 
 
 def _points(
     views: Sequence[View], content: dict[str, Any], options: BungeeOptions, file: Path
 ) -> tuple[PointCloud, str]:
-    """Points and a note on where they come from."""
+    """Return points and a note on their source."""
     if options.points != "random":
-        cloud = read_points(file.parent / options.points)
-        return cloud, f"Starts from the {len(cloud)} points of {options.points}."
+        return stored_points(file.parent, options.points)
     scale = finite_number(content.get("scene_scale"))
     if scale is None or scale <= 0:
         raise InputError(
@@ -220,7 +190,7 @@ def _points(
 
 
 def city_points(cameras: Sequence[Camera], count: int, height: float, generator: torch.Generator) -> PointCloud:
-    """Grey points where rays through random pixels of random cameras reach a random level in [0, `height`].
+    """Return grey points where rays through random pixels of random cameras reach a random level in [0, `height`].
 
     Points lie as densely as the cameras look, at all scales; none is farther from the origin than every camera.
 
@@ -244,19 +214,14 @@ def city_points(cameras: Sequence[Camera], count: int, height: float, generator:
 
 
 def _pixel_to_ray(camera: Camera) -> Float[Tensor, "3 3"]:
-    """Takes (x / width, y / height, 1) to the ray of that pixel in camera coordinates, at depth 1."""
-    return torch.tensor(
-        [
-            [camera.width / camera.fx, 0, -camera.cx / camera.fx],
-            [0, camera.height / camera.fy, -camera.cy / camera.fy],
-            [0, 0, 1],
-        ],
-        dtype=torch.float64,
-    )
+    """Return the matrix from (x / width, y / height, 1) to the ray of that pixel in camera coordinates, at depth 1."""
+    across = [camera.width / camera.fx, 0, -camera.cx / camera.fx]
+    down = [0, camera.height / camera.fy, -camera.cy / camera.fy]
+    return torch.tensor([across, down, [0, 0, 1]], dtype=torch.float64)
 
 
 def _scales(views: Sequence[View], centre: Float[Tensor, "3"], folder: Path, images: str) -> tuple[list[int], str]:
-    """The scale of each view, from 1, and what it is based on."""
+    """Return the scale of each view, from 1, and what it is based on."""
     file = folder / POSES_FILE
     content = read_json(file) if file.is_file() else {}
     names = [photo.name for photo in image_files(folder / images)]
@@ -268,24 +233,20 @@ def _scales(views: Sequence[View], centre: Float[Tensor, "3"], folder: Path, ima
 
 
 def _starts(value: Any, file: Path) -> list[int]:
-    """The numbers of the first image of each scale, farthest scale first."""
-    if (
-        not isinstance(value, list)
-        or not all(isinstance(start, int) for start in value)
-        or value != sorted(set(value), reverse=True)
-        or value[-1:] != [0]
-    ):
+    """Return the numbers of the first image of each scale, farthest scale first."""
+    whole = isinstance(value, list) and all(isinstance(start, int) for start in value)
+    if not whole or value != sorted(set(value), reverse=True) or value[-1:] != [0]:
         raise InputError(f"'{file}' has scale_split {value}, which must be whole numbers falling to 0.")
     return value
 
 
 def scale_of_number(number: int, starts: Sequence[int]) -> int:
-    """Scale of an image by its number among the sorted ones: they run from near (1) to far."""
+    """Return the scale of an image by its number among the sorted ones: they run from near (1) to far."""
     return sum(number >= start for start in starts)
 
 
 def scales_of_distances(distances: Float[Tensor, "N"]) -> list[int]:
-    """Scales 1 (near) to 4: bins of equal width between the smallest and the largest log distance."""
+    """Return scales 1 (near) to 4: bins of equal width between the smallest and the largest log distance."""
     logs = distances.double().clamp(min=torch.finfo(torch.float64).tiny).log()
     low, high = logs.min(), logs.max()
     if low == high:
@@ -295,8 +256,7 @@ def scales_of_distances(distances: Float[Tensor, "N"]) -> list[int]:
 
 
 def _scale_note(views: Sequence[View], basis: str) -> str:
-    counts = sorted(Counter(view.group for view in views).items())
-    listed = ", ".join(f"{group}: {count}" for group, count in counts)
+    listed = ", ".join(f"{group}: {count}" for group, count in sorted(Counter(view.group for view in views).items()))
     return f"Views of each scale, 1 closest (by {basis}): {listed}."
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import image_size, is_reduction
-from gsx.core.data.scene import Scene, View, extent_of
+from gsx.core.data.scene import Scene, View
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
 from gsx.core.files import at_home, is_file
@@ -29,26 +29,15 @@ from gsx.scenes.colmap_folders import (
     photo_folders,
     photo_folders_above,
 )
-from gsx.scenes.colmap_model import Model, ModelImage, error_told, read_model
-from gsx.scenes.duplicates import photos_of, refuse_file_twice, refuse_shared
+from gsx.scenes.colmap_model import Model, ModelImage, error_words, read_model
+from gsx.scenes.duplicates import photos_of, refuse_file_twice
 from gsx.scenes.masked import IMAGES, mask_notes
 from gsx.scenes.observations import Unmeasured, counted, known, straight_keypoints
-from gsx.scenes.options import SceneOptions, refuse_other, refuse_unknown
+from gsx.scenes.options import SceneOptions, refuse_other
 from gsx.scenes.orientation import RULES, TurnsOf, of_model, oriented_size
-from gsx.scenes.posed import (
-    MIN_IMAGES,
-    Shot,
-    lens_notes,
-    named,
-    provenance,
-    reduction_of,
-    refuse_partial,
-    refuse_too_few,
-    shot_through,
-    turn_notes,
-    views_of,
-)
-from gsx.scenes.similar_photos import similar_photo
+from gsx.scenes.photo_names import similar_photo
+from gsx.scenes.pose_files import refuse_partial, some_names
+from gsx.scenes.posed import MIN_IMAGES, Shot, check_sides, scene_of, shot_notes, shot_through, views_of
 from gsx.scenes.splits import split_names
 from gsx.scenes.undistort import METHOD, pinhole_of
 
@@ -57,27 +46,28 @@ MIN_VISIBLE_FRACTION = 0.5  # of the points, where the model keeps no observatio
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapOptions(SceneOptions):
-    """What `conf/scene/colmap.yaml` sets."""
+    """Options of `conf/scene/colmap.yaml`."""
 
     images: str
     """Image folder, relative to `path`; it may hold reduced images, such as `images_4`."""
     model: str = AUTO
     """Folder of the model, relative to `path`; auto: the one with the most images (gsx.scenes.colmap_folders)."""
     adjust: str = "never"
-    """never | auto | always: whether poses and intrinsics are found anew from the model's observations
-    (gsx.scenes.adjust)."""
+    """never | auto | always: whether the model's observations adjust poses and intrinsics (gsx.scenes.adjust)."""
     max_reprojection_px: Annotated[float, Range(0, 1e6)]
     """The scene is refused when the median reprojection error exceeds this, in pixels of the model's cameras."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        refuse_other("adjust", self.adjust, WHEN)
 
 
 def load(options: ColmapOptions) -> Scene:
     """Load a COLMAP scene.
 
     Raises:
-        ConfigError: an option has no such value.
         InputError: no model or photos, a file is corrupt, sizes disagree, or the poses do not fit the observations.
     """
-    refuse_other("adjust", options.adjust, WHEN)
     path = at_home(options.path)
     folder, notes = find_model(path, options.model)
     stated = read_model(folder)
@@ -90,7 +80,7 @@ def load(options: ColmapOptions) -> Scene:
 def build(
     model: Model, photos: Path, options: ColmapOptions, notes: Sequence[str], turns_of: TurnsOf | None = None
 ) -> Scene:
-    """The scene of a model whose images are in the folder `photos`; `notes` come first among the scene's.
+    """Return the scene of a model whose images are in the folder `photos`; `notes` come first among the scene's.
 
     `turns_of` finds the turns of a photo; None: as `options.orientation` says.
 
@@ -99,38 +89,34 @@ def build(
     """
     path = at_home(options.path)
     present = present_images(model, photos, options.missing)
-    refuse_unknown(options)
     turns_of = turns_of or RULES[options.orientation]
-    shots = [shot_of(model, image, photos, turns_of) for image in present]
+    shots = [
+        shot_through(
+            model.cameras[image.camera_id], image.name, photos / image.name, image.rotation, image.translation, turns_of
+        )
+        for image in present
+    ]
     views = views_of(shots, options)
     fit = check_cameras(model, present, shots, views, options.max_reprojection_px)
     train, test = split_names([view.name for view in views], options.split, path, photos_of(views))
-    train_views, test_views = ([views[index] for index in side] for side in (train, test))
-    refuse_too_few(train_views, path)
-    refuse_shared(train_views, test_views, photos)
-    return Scene(
-        name=path.resolve().name,
-        train=train_views,
-        test=test_views,
-        points=model.points,
-        background=torch.tensor(list(options.background), dtype=torch.float32),
-        reduction=reduction_of(options),
-        extent=extent_of([view.camera for view in train_views]),
-        notes=[
-            *notes,
-            *model.notes,
-            *_missing_note(model, present),
-            *lens_notes(shots),
-            *turn_notes(shots),
-            *mask_notes(views, options),
-            fit,
-        ],
-        provenance=_provenance(model, shots, views, options),
-    )
+    sides = [views[index] for index in train], [views[index] for index in test]
+    check_sides(sides, path)
+    notes = [*notes, *model.notes, *_missing_note(model, present), *shot_notes(shots), *mask_notes(views, options), fit]
+    bent = any(shot.remap is not None for shot in shots)
+    details = {
+        "image_folder": Path(options.images).name,
+        "camera_models": sorted({camera.model_name for camera in model.cameras.values()}),
+        "undistortion": METHOD if bent else None,
+        **({} if options.adjust == "never" else {"adjust": options.adjust}),
+    }
+    return scene_of(options, path, views, sides, model.points, notes, details)
+
+
+# -- images ------------------------------------------------------------------------------------------------------------
 
 
 def present_images(model: Model, photos: Path, missing: float) -> list[ModelImage]:
-    """The images of the model whose photo exists.
+    """Return the images of the model whose photo exists.
 
     Raises:
         InputError: none or only one exists, more than the share `missing` does not, or two images are one file.
@@ -139,7 +125,7 @@ def present_images(model: Model, photos: Path, missing: float) -> list[ModelImag
     if not present and model.images:
         names = [image.name for image in model.images]
         raise InputError(
-            f"None of the {len(names)} images of {model.folder} is in {photos} (looked for {named(names)}): "
+            f"None of the {len(names)} images of {model.folder} is in {photos} (looked for {some_names(names)}): "
             f"{similar_photo(photos, names) or 'set scene.images to the folder that holds them'}."
         )
     if len(present) < MIN_IMAGES:
@@ -147,32 +133,35 @@ def present_images(model: Model, photos: Path, missing: float) -> list[ModelImag
             f"{model.folder} has {len(model.images)} registered images, {len(present)} of them in {photos}, but "
             f"training needs at least {MIN_IMAGES}: add photos and reconstruct again."
         )
-    absent = _missing(model, present)
+    absent = _absent(model, present)
     hint = similar_photo(photos, absent) if len(absent) > missing * len(model.images) else ""
     refuse_partial(absent, len(model.images), model.folder, missing, remedy=hint or "complete them")
     refuse_file_twice([image.name for image in present], [photos / image.name for image in present], model.folder)
     return present
 
 
-def shot_of(model: Model, image: ModelImage, photos: Path, turns_of: TurnsOf) -> Shot:
-    """An image of the model as the pinhole photo that gsx uses.
+def _absent(model: Model, present: Sequence[ModelImage]) -> list[str]:
+    """Return names of the images that are not among those present."""
+    return sorted({image.name for image in model.images} - {image.name for image in present})
 
-    Raises:
-        InputError: the photo's size is no uniform reduction of its camera's, or that has no pinhole equivalent.
-    """
-    intrinsics = model.cameras[image.camera_id]
-    return shot_through(intrinsics, image.name, photos / image.name, image.rotation, image.translation, turns_of)
+
+def _missing_note(model: Model, present: Sequence[ModelImage]) -> list[str]:
+    missing = _absent(model, present)
+    return [f"Skipped {len(missing)} images whose photos are missing: {some_names(missing)}."] if missing else []
+
+
+# -- cameras -----------------------------------------------------------------------------------------------------------
 
 
 def check_cameras(
     model: Model, images: Sequence[ModelImage], shots: Sequence[Shot], views: Sequence[View], limit: float
 ) -> str:
-    """Compare the cameras to train with against what the model observed; returns the finding as a note.
+    """Compare the cameras to train with against what the model observed; returns the result as a note.
 
     Raises:
         InputError: the median error exceeds `limit` pixels of the model, or (no observations) few points are in view.
     """
-    # views without their centring, if any: that is an approximation asked for, not a mistake to be found
+    # views without their centring, if any: that is an approximation that the user chose, not a mistake
     sizes = [oriented_size(view.camera.size, shot.turns.last) for shot, view in zip(shots, views, strict=True)]
     cameras = [shot.whole.resize(*size) for shot, size in zip(shots, sizes, strict=True)]
     lenses = [model.cameras[image.camera_id] for image in images]
@@ -191,11 +180,8 @@ def check_cameras(
 
 def _misses(model: Model, median: float, limit: float, rest: Unmeasured) -> str:
     """Return the message for cameras whose median reprojection error exceeds the limit."""
-    missed = (
-        "have most of the points that they observe behind them"
-        if math.isinf(median)
-        else f"miss the observed keypoints by {median:.3g} px"
-    )
+    behind = "have most of the points that they observe behind them"
+    missed = behind if math.isinf(median) else f"miss the observed keypoints by {median:.3g} px"
     return (
         f"The cameras of {model.folder} {missed} (median; the limit is scene.max_reprojection_px={limit:g}{rest}): "
         "poses, intrinsics or files of different reconstructions are mixed. Where they are only inexact, "
@@ -226,55 +212,33 @@ def _check_visible(model: Model, cameras: Sequence[Camera], rest: Unmeasured) ->
             f"Only {fraction:.0%} of the points of {model.folder} are in view of any camera (at least "
             f"{MIN_VISIBLE_FRACTION:.0%} should be): points and poses belong to different reconstructions."
         )
-    why = (
-        "No keypoint can check the cameras"
-        if rest.no_ray
-        else "The model keeps no observations to check the cameras by"
-    )
+    without = "The model keeps no observations to check the cameras by"
+    why = "No keypoint can check the cameras" if rest.no_ray else without
     return f"{why}; {fraction:.0%} of its points are in view{rest}."
 
 
-def _missing(model: Model, present: Sequence[ModelImage]) -> list[str]:
-    """Names of the images that are not among those present."""
-    return sorted({image.name for image in model.images} - {image.name for image in present})
-
-
-def _missing_note(model: Model, present: Sequence[ModelImage]) -> list[str]:
-    missing = _missing(model, present)
-    return [f"Skipped {len(missing)} images whose photos are missing: {named(missing)}."] if missing else []
-
-
-def _provenance(model: Model, shots: Sequence[Shot], views: Sequence[View], options: ColmapOptions) -> dict[str, Any]:
-    bent = any(shot.remap is not None for shot in shots)
-    return provenance(
-        options,
-        views,
-        image_folder=Path(options.images).name,
-        camera_models=sorted({camera.model_name for camera in model.cameras.values()}),
-        undistortion=METHOD if bent else None,
-        **({} if options.adjust == "never" else {"adjust": options.adjust}),
-    )
+# -- folders -----------------------------------------------------------------------------------------------------------
 
 
 def facts(path: Path) -> Iterator[str]:
-    """The model, its cameras, and the images that are there."""
+    """Yield lines on the model, its cameras, and the images that are there."""
     folder = find_model(path)[0]
     model = read_model(folder)
-    yield f"model     {folder}: {len(model.images)} images, {error_told(model.mean_error)}"
+    yield f"model     {folder}: {len(model.images)} images, {error_words(model.mean_error)}"
     yield f"fit       {fit_line(model)}"
     cameras = [model.cameras[image.camera_id] for image in model.images]
     kinds = Counter((camera.model_name, camera.width, camera.height) for camera in cameras)
     for (name, width, height), count in sorted(kinds.items()):
         yield f"camera    {name} {width}x{height}, {count} images"
     images = image_folder(path, model)
-    present = {image.name for image in model.images if is_file(path / images / image.name)}
-    absent = sorted({image.name for image in model.images} - present)
-    missing = f", absent: {named(absent)}" if absent else ""
-    yield f"images    {len(present)} of {len(model.images)} in {images}{missing}"
+    present = [image for image in model.images if is_file(path / images / image.name)]
+    absent = _absent(model, present)
+    missing = f", absent: {some_names(absent)}" if absent else ""
+    yield f"images    {len({image.name for image in present})} of {len(model.images)} in {images}{missing}"
 
 
 def overrides(path: Path) -> dict[str, str]:
-    """The folder of the images, where that is another than usual."""
+    """Return the folder of the images, where that is another than usual."""
     images = image_folder(path, read_model(find_model(path)[0]))
     return {} if images == IMAGES else {"images": images}
 

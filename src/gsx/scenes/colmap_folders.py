@@ -111,8 +111,10 @@ def find_model(path: Path, name: str = AUTO) -> tuple[Path, list[str]]:
     Raises:
         InputError: there is no model, or one lacks a file.
     """
+    if name != AUTO and not holds_model(path / name, 1):
+        raise InputError(f"scene.model '{name}' is no folder with a COLMAP model in {path}: correct or omit it.")
     if name != AUTO:
-        return _named_model(path, name), []
+        return path / name, []
     folders = model_folders(path) or other_model_folders(path)
     if not folders:
         raise InputError(
@@ -120,14 +122,8 @@ def find_model(path: Path, name: str = AUTO) -> tuple[Path, list[str]]:
             "scene.path must be the folder that holds sparse/ and images/ (photos only: use scene=photos)."
         )
     counts = {folder: _count_or_refuse(path, folder, folders) for folder in folders}
-    best = max(folders, key=lambda folder: counts[folder])  # max keeps the first of equals
+    best = max(counts, key=lambda folder: counts[folder])  # max keeps the first of equals
     return best, [*_choice_note(path, best, counts)]
-
-
-def _named_model(path: Path, name: str) -> Path:
-    if not holds_model(path / name, 1):
-        raise InputError(f"scene.model '{name}' is no folder with a COLMAP model in {path}: correct or omit it.")
-    return path / name
 
 
 def _count_or_refuse(path: Path, folder: Path, folders: Sequence[Path]) -> int:
@@ -140,8 +136,12 @@ def _count_or_refuse(path: Path, folder: Path, folders: Sequence[Path]) -> int:
 
 
 def _choice_note(path: Path, best: Path, counts: Mapping[Path, int]) -> Iterator[str]:
-    elsewhere = {} if best in other_model_folders(path) else _larger_elsewhere(path, counts[best])
-    others = {folder: count for folder, count in {**counts, **elsewhere}.items() if folder != best}
+    elsewhere: dict[Path, int] = {}
+    for folder in other_model_folders(path):
+        with suppress(InputError):
+            elsewhere[folder] = count_images(folder)
+    larger = {folder: count for folder, count in elsewhere.items() if count > counts[best] and best not in elsewhere}
+    others = {folder: count for folder, count in {**counts, **larger}.items() if folder != best}
     if others:
         unused = ", ".join(f"{place(path, folder)} ({count})" for folder, count in others.items())
         yield (
@@ -150,15 +150,6 @@ def _choice_note(path: Path, best: Path, counts: Mapping[Path, int]) -> Iterator
         )
     elif best not in model_folders(path):
         yield f"Took the model {place(path, best)} with {counts[best]} images."
-
-
-def _larger_elsewhere(path: Path, count: int) -> dict[Path, int]:
-    """Models in other places that have more images."""
-    found: dict[Path, int] = {}
-    for folder in other_model_folders(path):
-        with suppress(InputError):
-            found[folder] = count_images(folder)
-    return {folder: images for folder, images in found.items() if images > count}
 
 
 def place(path: Path, folder: Path) -> str:

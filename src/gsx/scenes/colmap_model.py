@@ -26,11 +26,11 @@ from gsx.core.files import refuse_lfs_pointer
 from gsx.core.shapes import Bool, Float
 from gsx.formats.origin import in_single_where_resolved
 from gsx.scenes.colmap_folders import model_files
-from gsx.scenes.colmap_poses import pose_conflict, text_conflict, unmatched
+from gsx.scenes.colmap_poses import pose_conflict, unmatched
 from gsx.scenes.colmap_records import U64, check_binary, contradiction
 from gsx.scenes.colmap_text import write_as_binary
 from gsx.scenes.points import read_points
-from gsx.scenes.posed import named
+from gsx.scenes.pose_files import some_names
 
 OBSERVATIONS_PER_IMAGE = 1000  # read of each image: the reprojection check is a median over all images
 QUATERNION_TOLERANCE = 0.01  # of its length, 1: text formats round
@@ -81,14 +81,15 @@ def read_model(folder: Path) -> Model:
     read = _points_of_ply if file.suffix.lower() == ".ply" else _points
     points, positions, point_notes = read(reconstruction, file)
     mean_error, error_notes = stated_error(reconstruction)
-    images = _images(reconstruction, positions, file)
+    registered = [reconstruction.image(number) for number in reconstruction.reg_image_ids()]
+    images = sorted((_image(image, positions, file) for image in registered), key=lambda image: image.name)
     return Model(
         folder=folder,
         cameras={number: copy.copy(camera) for number, camera in sorted(reconstruction.cameras.items())},
         images=images,
         points=points,
         mean_error=mean_error,
-        notes=[*notes, *([conflict] if conflict else []), *point_notes, *lost_note(images, file), *error_notes],
+        notes=[*notes, *filter(None, [conflict]), *point_notes, *lost_note(images, file), *error_notes],
         conflict=conflict,
     )
 
@@ -97,7 +98,7 @@ def lost_note(images: Sequence[ModelImage], file: Path) -> list[str]:
     """Return a note on points that images observe and the file of points lacks, as where a script has removed some."""
     names = [image.name for image in images if image.lost]
     lost = f"Images observe points that {file.name} lacks, as where points were removed from it alone"
-    return [f"{lost}: these observations are left out ({len(names)} images: {named(names)})."] if names else []
+    return [f"{lost}: these observations are left out ({len(names)} images: {some_names(names)})."] if names else []
 
 
 Positions = Mapping[int, Float[Tensor, "3"]]
@@ -137,18 +138,14 @@ def stated_error(reconstruction: Any) -> tuple[float, list[str]]:
     return float(finite.mean()) if len(finite) else math.nan, [left] if len(finite) < len(errors) else []
 
 
-def error_told(mean_error: float) -> str:
+def error_words(mean_error: float) -> str:
     """Return the mean reprojection error of a model in words; NaN: it states none."""
     return "no reprojection error stated" if math.isnan(mean_error) else f"mean reprojection error {mean_error:.2f} px"
 
 
 @contextmanager
 def binary_model(files: Mapping[str, Path]) -> Iterator[tuple[Path, list[str]]]:
-    """Yield a folder with the binary files of a model under COLMAP's names, and notes on what its text states.
-
-    Raises:
-        InputError: a file is no text or binary file of a model, or damaged.
-    """
+    """Yield a folder with the binary files of a model under COLMAP's names, and notes on what its text states."""
     folders = {file.parent for file in files.values()}
     if all(file.name == f"{name}.bin" for name, file in files.items()) and len(folders) == 1:
         yield folders.pop(), []
@@ -166,9 +163,7 @@ def binary_model(files: Mapping[str, Path]) -> Iterator[tuple[Path, list[str]]]:
 
 
 def reconstruction_of(folder: Path) -> tuple[Any, list[str], str]:
-    """Return the pycolmap.Reconstruction of a model folder, notes on what its text states, and a note on poses.
-
-    The last says where files contradict each other about poses, and is empty otherwise.
+    """Return the pycolmap.Reconstruction of a model folder, notes on its text, and a note on poses, empty if all agree.
 
     Raises:
         InputError: a file is missing, truncated or corrupt, or files contradict each other.
@@ -188,15 +183,16 @@ def reconstruction_of(folder: Path) -> tuple[Any, list[str], str]:
                 f"pycolmap cannot read the COLMAP model {folder} ({', '.join(file.name for file in files.values())}): "
                 f"{contradiction(binary) or unmatched(binary) or plain(problem)}; {remedy_of(files)}."
             ) from None
-        return found, notes, pose_conflict(binary, files, found) or text_conflict(files, found)
+        return found, notes, pose_conflict(binary, files, found)
 
 
 def remedy_of(files: Mapping[str, Path]) -> str:
     """Return what to do about a model that cannot be read."""
+    again = "copy or make the model again"
     if "frames" not in files:
-        return "copy or make the model again"
+        return again
     poses, frames, rigs = (files[name].name for name in ("images", "frames", "rigs"))
-    return f"copy or make the model again, or remove {frames} and {rigs} to use the poses in {poses}"
+    return f"{again}, or remove {frames} and {rigs} to use the poses in {poses}"
 
 
 def plain(problem: Exception) -> str:
@@ -205,27 +201,13 @@ def plain(problem: Exception) -> str:
     return "its files contradict each other" if words.startswith(("unordered_map", "vector::")) else words
 
 
-def present_files(folder: Path) -> Iterator[Path]:
-    """Yield the files of a model that are there; by COLMAP 4 its poses are in `frames` and `rigs`."""
-    yield from model_files(folder).values()
-
-
 def _usable(positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
     """Which points are finite in float32; false for NaN as well."""
     return (positions.abs() <= torch.finfo(torch.float32).max).all(dim=1)
 
 
-def _images(reconstruction: Any, positions: Positions | None, file: Path) -> list[ModelImage]:
-    images = [reconstruction.image(number) for number in reconstruction.reg_image_ids()]
-    return [_image(image, positions, file) for image in sorted(images, key=lambda image: _name(image, file))]
-
-
 def _image(image: Any, positions: Positions | None, file: Path) -> ModelImage:
-    """An image with its observations, None: without.
-
-    Raises:
-        InputError: `file` is text and lacks a point that the image observes.
-    """
+    """Return an image with its observations (None: without); InputError for a point that `file`, a text, lacks."""
     indices = [] if positions is None else image.get_observation_point2D_idxs()
     step = -(-len(indices) // OBSERVATIONS_PER_IMAGE) or 1
     seen = [image.point2D(index) for index in indices[::step]]
@@ -255,11 +237,7 @@ def _image(image: Any, positions: Positions | None, file: Path) -> ModelImage:
 
 
 def _name(image: Any, file: Path) -> str:
-    """Return the name of an image's photo, with `/` for the backslashes of Windows.
-
-    Raises:
-        InputError: it is no text.
-    """
+    """Return the name of an image's photo, with `/` for the backslashes of Windows; InputError: it is no text."""
     try:
         return str(image.name).replace("\\", "/")
     except UnicodeDecodeError as error:

@@ -16,7 +16,7 @@ import numpy as np
 
 from gsx.scenes.colmap_records import FRAME, IMAGE_HEAD, SKIPS, U64
 from gsx.scenes.colmap_text import text_poses
-from gsx.scenes.posed import named
+from gsx.scenes.pose_files import some_names
 
 IMAGE_POSE = struct.Struct("<I7d")  # id; quaternion w, x, y, z; translation
 FRAME_IMAGE = struct.Struct("<iIQ")  # type of sensor, its id, id of the image
@@ -45,7 +45,7 @@ class Difference:
         """Return how many images differ, by how much, and some names."""
         kinds = [f"by up to {self.degrees:.3g} degrees and {self.units:.3g} units"] if self.degrees + self.units else []
         kinds += [f"{self.broken} without a rotation"] if self.broken else []
-        return f"{len(self.names)} images ({', '.join(kinds)}: {named(self.names)})"
+        return f"{len(self.names)} images ({', '.join(kinds)}: {some_names(self.names)})"
 
 
 def pose_conflict(folder: Path, files: Mapping[str, Path], reconstruction: Any) -> str:
@@ -53,36 +53,24 @@ def pose_conflict(folder: Path, files: Mapping[str, Path], reconstruction: Any) 
 
     folder: of the binary files that were read; files: the model's own, by what they hold.
     """
-    used = {image.image_id: image for image in reconstruction.images.values() if image.has_pose}
+    used = [image for image in reconstruction.images.values() if image.has_pose]
     if (folder / "frames.bin").is_file():
         stated = {number: pose for number, pose, _ in binary_poses(folder / "images.bin")}
-        found = difference((used[number], stated[number]) for number in used if number in stated)
-        return _of_frames(files, found) if found else ""
-    return ""
-
-
-def text_conflict(files: Mapping[str, Path], reconstruction: Any) -> str:
-    """Return a note where images.txt lies next to the binary model in use and states other poses; else empty."""
+        if other := difference((image, stated[image.image_id]) for image in used if image.image_id in stated):
+            images, frames, rigs = (files[name].name for name in ("images", "frames", "rigs"))
+            return (
+                f"{images} and {frames} state different poses of {other}: those of {frames} are used, as by COLMAP 4. "
+                f"If {images} is right, remove {frames} and {rigs}."
+            )
     text = files["images"].with_name("images.txt")
-    if files["images"].suffix.lower() != ".bin" or not text.is_file():
-        return ""
-    stated = dict(text_poses(text))
-    used = {_name(image): image for image in reconstruction.images.values() if image.has_pose}
-    found = difference((used[name], stated[name]) for name in sorted(used.keys() & stated.keys()))
-    if found is None:
-        return ""
-    return (
-        f"{text.name} states other poses than the binary model for {found}: the binary model is used. If the text is "
-        "right, remove the binary files."
-    )
-
-
-def _of_frames(files: Mapping[str, Path], found: Difference) -> str:
-    images, frames, rigs = (files[name].name for name in ("images", "frames", "rigs"))
-    return (
-        f"{images} and {frames} state different poses of {found}: those of {frames} are used, as by COLMAP 4. If "
-        f"{images} is right, remove {frames} and {rigs}."
-    )
+    if files["images"].suffix.lower() == ".bin" and text.is_file():
+        by_name, texts = {_name(image): image for image in used}, dict(text_poses(text))
+        if other := difference((by_name[name], texts[name]) for name in sorted(by_name.keys() & texts)):
+            return (
+                f"{text.name} states other poses than the binary model for {other}: the binary model is used. If the "
+                "text is right, remove the binary files."
+            )
+    return ""
 
 
 def _name(image: Any) -> str:
@@ -106,31 +94,27 @@ def binary_poses(file: Path) -> Iterator[tuple[int, np.ndarray, str]]:
 @np.errstate(all="ignore")  # what is not finite is no equal pose
 def difference(pairs: Iterable[tuple[Any, np.ndarray]]) -> Difference | None:
     """Return how poses that are stated differ from those of pycolmap images; None: they do not."""
-    images, poses = [], []
-    for image, pose in pairs:
-        images.append(image)
-        poses.append(pose)
-    if not images:
+    compared = list(pairs)
+    if not compared:
         return None
-    used = np.array([image.cam_from_world().matrix() for image in images])
-    stated = np.array([matrix_of(pose) for pose in poses])
+    used = np.array([image.cam_from_world().matrix() for image, _ in compared])
+    stated = np.array([matrix_of(pose) for _, pose in compared])
     turns, steps = angles(used, stated), np.linalg.norm(centres(used) - centres(stated), axis=1)
     near = tolerance(centres(used))
     same = (turns <= TOLERANCE) & (steps <= near)  # false for NaN
-    names = sorted(_name(images[index]) for index in np.flatnonzero(~same))
+    names = sorted(_name(compared[index][0]) for index in np.flatnonzero(~same))
     broken = int((~np.isfinite(turns + steps)).sum())
     return Difference(names, math.degrees(_above(turns, TOLERANCE)), _above(steps, near), broken) if names else None
 
 
 def matrix_of(pose: np.ndarray) -> np.ndarray:
     """Return the matrix (3 x 4) of a quaternion w, x, y, z of any length and a translation; NaN for length 0."""
-    with np.errstate(all="ignore"):
-        w, x, y, z = pose[:4] / np.linalg.norm(pose[:4])
-        rotation = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
+    w, x, y, z = pose[:4] / np.linalg.norm(pose[:4])
+    rotation = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
     return np.concatenate([np.array(rotation), pose[4:, None]], axis=1)
 
 

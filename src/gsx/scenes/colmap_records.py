@@ -26,10 +26,6 @@ def check_binary(name: str, file: Path) -> None:
     Raises:
         InputError: it ends within a record or goes on after the last, or a camera model is unknown to pycolmap.
     """
-    _walk(file, SKIPS[name])
-
-
-def _walk(file: Path, skip: Callable[[Bytes, int], int]) -> None:
     size = file.stat().st_size
     if size < U64.size:
         raise _truncated(file, 0, 0)
@@ -38,7 +34,7 @@ def _walk(file: Path, skip: Callable[[Bytes, int], int]) -> None:
         at = U64.size
         for index in range(count):
             try:
-                at = skip(data, at)
+                at = SKIPS[name](data, at)
             except struct.error:
                 raise _truncated(file, index, count) from None
             except ValueError as problem:

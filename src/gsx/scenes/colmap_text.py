@@ -30,8 +30,7 @@ STATED = re.compile(r"#\s*Number of \w+:\s*(\d+)")
 def write_as_binary(files: Mapping[str, Path], folder: Path) -> list[str]:
     """Write the binary files of a text model to `folder`; files: by what they hold (`cameras`, `images`, ...).
 
-    Returns:
-        A note for each file that holds another number of records than its comments state.
+    Returns a note for each file that holds another number of records than its comments state.
 
     Raises:
         InputError: a file is no text, or a line is wrong.
@@ -67,11 +66,7 @@ Reader = Callable[[Lines], Iterator[bytes]]
 
 
 def records_of(file: Path, read: Reader) -> Iterator[bytes]:
-    """Yield the binary records of a text file.
-
-    Raises:
-        InputError: it is no text, or a line is wrong.
-    """
+    """Yield the binary records of a text file; InputError: it is no text, or a line is wrong."""
     lines = Lines(file)
     try:
         yield from read(lines)
@@ -122,14 +117,10 @@ def _cameras(lines: Lines) -> Iterator[bytes]:
         number, count = numbers[model]
         if len(params) != count:
             raise ValueError(f"camera model {model} has {count} parameters, and {len(params)} are there")
-        yield ID_MODEL_SIZE.pack(_whole(identity), number, *_size(width, height)) + _floats(params).tobytes()
-
-
-def _size(width: str, height: str) -> tuple[int, int]:
-    size = _whole(width), _whole(height)
-    if not all(0 < side <= LARGEST_SIDE for side in size):
-        raise ValueError(f"a camera of {width}x{height} pixels")
-    return size
+        size = _whole(width), _whole(height)
+        if not all(0 < side <= LARGEST_SIDE for side in size):
+            raise ValueError(f"a camera of {width}x{height} pixels")
+        yield ID_MODEL_SIZE.pack(_whole(identity), number, *size) + _floats(params).tobytes()
 
 
 def _images(lines: Lines) -> Iterator[bytes]:
@@ -139,7 +130,9 @@ def _images(lines: Lines) -> Iterator[bytes]:
             raise ValueError("it is no IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME")
         pose = _floats(numbers[1:8]).tobytes()
         head = struct.pack("<I", _whole(numbers[0])) + pose + struct.pack("<I", _whole(numbers[8]))
-        yield head + _name(name) + _keypoints(keypoints)
+        if "\0" in name:
+            raise ValueError("the name holds a NUL character")
+        yield head + name.encode() + b"\0" + _keypoints(keypoints)
 
 
 def _image_lines(lines: Lines) -> Iterator[tuple[str, str]]:
@@ -161,15 +154,12 @@ def _image_lines(lines: Lines) -> Iterator[tuple[str, str]]:
 def _is_header(line: str) -> bool:
     """Recognise the first line of an image where keypoints are due: it has whole numbers for ids, and then a name."""
     words = _header_words(line)
-    whole = len(words) > NAME_AT and words[0].isdecimal() and words[NAME_AT - 1].isdecimal()
-    return whole and not _are_keypoints(line)
-
-
-def _are_keypoints(line: str) -> bool:
-    try:
-        return bool(_keypoints(line))
-    except ValueError:
+    if not (len(words) > NAME_AT and words[0].isdecimal() and words[NAME_AT - 1].isdecimal()):
         return False
+    try:
+        return not _keypoints(line)
+    except ValueError:
+        return True
 
 
 def _header_words(line: str) -> list[str]:
@@ -177,48 +167,31 @@ def _header_words(line: str) -> list[str]:
     return re.split(r"[ \t]+", line, maxsplit=NAME_AT)
 
 
-def _name(name: str) -> bytes:
-    if "\0" in name:
-        raise ValueError("the name holds a NUL character")
-    return name.encode() + b"\0"
-
-
 def _keypoints(line: str) -> bytes:
+    """Return keypoints (X, Y, POINT3D_ID) as COLMAP stores them."""
     values = _floats(line.split())
     if len(values) % 3:
         raise ValueError(f"{len(values)} numbers are no keypoints, which have three (X, Y, POINT3D_ID) each")
     rows = values.reshape(-1, 3)
-    return U64.pack(len(rows)) + _keypoint_rows(rows).tobytes()
-
-
-def _keypoint_rows(rows: np.ndarray) -> np.ndarray:
-    """Return keypoints [K, 3] as COLMAP stores them."""
     ids, stored = rows[:, 2], np.empty(len(rows), KEYPOINTS)
     if not (ids == np.floor(ids)).all():
         raise ValueError("a POINT3D_ID is no whole number")
     observed = (ids >= 0) & (ids < 2.0**63)
     stored["x"], stored["y"] = rows[:, 0], rows[:, 1]
     stored["point"] = np.where(observed, np.where(observed, ids, 0).astype(np.uint64), np.uint64(NO_POINT))
-    return stored
+    return U64.pack(len(rows)) + stored.tobytes()
 
 
 def _points(lines: Lines) -> Iterator[bytes]:
     for words in _rows(lines, 8, "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"):
+        colour, track = [_whole(word) for word in words[4:7]], words[8:]
+        if max(colour) > 255:
+            raise ValueError(f"'{' '.join(words[4:7])}' is no colour, whose values go from 0 to 255")
+        if len(track) % 2:
+            raise ValueError(f"{len(track)} numbers are no track, which has two (IMAGE_ID, POINT2D_IDX) for each image")
         position, error = _floats(words[1:4]).tobytes(), _floats(words[7:8]).tobytes()
-        yield U64.pack(_whole(words[0])) + position + _colour(words[4:7]) + error + _track(words[8:])
-
-
-def _colour(words: Sequence[str]) -> bytes:
-    values = [_whole(word) for word in words]
-    if max(values) > 255:
-        raise ValueError(f"'{' '.join(words)}' is no colour, whose values go from 0 to 255")
-    return bytes(values)
-
-
-def _track(words: Sequence[str]) -> bytes:
-    if len(words) % 2:
-        raise ValueError(f"{len(words)} numbers are no track, which has two (IMAGE_ID, POINT2D_IDX) for each image")
-    return U64.pack(len(words) // 2) + np.array([_whole(word) for word in words], dtype="<u4").tobytes()
+        elements = np.array([_whole(word) for word in track], dtype="<u4").tobytes()
+        yield U64.pack(_whole(words[0])) + position + bytes(colour) + error + U64.pack(len(track) // 2) + elements
 
 
 def _rigs(lines: Lines) -> Iterator[bytes]:
@@ -284,11 +257,7 @@ def _rows(lines: Lines, least: int, columns: str) -> Iterator[list[str]]:
 
 
 def _whole(word: str) -> int:
-    """Return a whole number, also one that is written `12.0`.
-
-    Raises:
-        ValueError: it is none, or negative.
-    """
+    """Return a whole number, also one that is written `12.0`; ValueError: it is none, or negative."""
     number = int(word) if word.isdecimal() else _float(word)
     if not (0 <= number < 2.0**63 and number == int(number)):
         raise ValueError(f"'{word}' is no whole number of 0 or more")

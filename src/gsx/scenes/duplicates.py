@@ -44,12 +44,12 @@ def refuse_shared(train: Sequence[View], test: Sequence[View], place: Path) -> N
 
 
 def photos_of(views: Iterable[View]) -> list[Path]:
-    """The files that views are read from, each once."""
+    """Return the files that views are read from, each once."""
     return list(dict.fromkeys(view.file for view in views if view.file is not None))
 
 
 def alike(candidates: Sides, key: Callable[[Path], Hashable]) -> list[Sides]:
-    """The candidates by equal `key`, where those to train on and those to test on share one.
+    """Group candidates by equal `key`, and return the groups with photos of both sides.
 
     Raises:
         InputError: a file cannot be read.
@@ -57,38 +57,32 @@ def alike(candidates: Sides, key: Callable[[Path], Hashable]) -> list[Sides]:
     groups: dict[Hashable, Sides] = defaultdict(lambda: ([], []))
     for side, photos in enumerate(candidates):
         for photo in photos:
-            groups[_told(key, photo)][side].append(photo)
+            try:
+                groups[key(photo)][side].append(photo)
+            except OSError as problem:
+                raise InputError(
+                    f"Image '{photo}' cannot be read ({problem.strerror}): restore it, or its permissions."
+                ) from None
     return [group for group in groups.values() if all(group)]
 
 
 def size(photo: Path) -> int:
-    """Of a file, bytes."""
+    """Return the number of bytes of a file."""
     return photo.stat().st_size
 
 
 def digest_of_parts(photo: Path) -> bytes:
-    """A digest of three blocks of a file."""
-    found = hashlib.sha256()
+    """Return a digest of three blocks of a file."""
+    parts = hashlib.sha256()
     with photo.open("rb") as stream:
         end = max(stream.seek(0, os.SEEK_END) - BLOCK, 0)
         for start in (0, end // 2, end):
             stream.seek(start)
-            found.update(stream.read(BLOCK))
-    return found.digest()
+            parts.update(stream.read(BLOCK))
+    return parts.digest()
 
 
 def digest(photo: Path) -> bytes:
-    """A digest of a file."""
+    """Return a digest of a file."""
     with photo.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").digest()
-
-
-def _told(key: Callable[[Path], Hashable], photo: Path) -> Hashable:
-    try:
-        return key(photo)
-    except OSError as problem:
-        raise _unreadable(photo, problem) from None
-
-
-def _unreadable(photo: Path, problem: OSError) -> InputError:
-    return InputError(f"Image '{photo}' cannot be read ({problem.strerror}): restore it, or its permissions.")

@@ -13,11 +13,7 @@ NO_LENS: Lens = ("", "", 0.0, 0.0)
 
 
 def lens_of(path: str | Path) -> Lens:
-    """Return what took a photo.
-
-    Raises:
-        InputError: the file is missing or is no image.
-    """
+    """Return what took a photo; InputError: the file is missing or is no image."""
     spec = header_of(path)
     maker, model = (spec.get_string_attribute(name, "") for name in ("Make", "Model"))
     lengths = [spec.get_float_attribute(f"Exif:{name}", 0.0) for name in ("FocalLength", "FocalLengthIn35mmFilm")]
@@ -26,10 +22,6 @@ def lens_of(path: str | Path) -> Lens:
 
 
 def orientation_of(path: str | Path) -> int:
-    """Return the EXIF orientation, 1 to 8; 1 (as stored) where a file states none, or no such number.
-
-    Raises:
-        InputError: the file is missing or is no image.
-    """
+    """Return the EXIF orientation, 1 to 8; 1 (as stored) where a file states none, or no such number."""
     value = int(header_of(path).get_int_attribute("Orientation", 1))
     return value if 1 <= value <= 8 else 1

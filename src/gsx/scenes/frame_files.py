@@ -7,7 +7,7 @@ from typing import Any
 
 from gsx.core.errors import InputError
 from gsx.scenes.lenses import beyond_angle, states_lens
-from gsx.scenes.posed import frames_in, read_frames, read_json, refuse_twice
+from gsx.scenes.pose_files import frames_in, read_frames, read_json, refuse_twice
 
 FILE, TRAIN_FILE = "transforms.json", "transforms_train.json"
 TEST_FILES = ("transforms_test.json", "transforms_val.json")
@@ -33,12 +33,14 @@ def frame_files(path: Path) -> list[FrameFile]:
     """
     file = path if path.is_file() else path / FILE
     if not file.is_file() and (path / TRAIN_FILE).is_file():
-        return _pair(path)
-    content, frames = read_frames(file)
-    parts = [FrameFile(file, content, frames)]
-    if content.get(TEST_FRAMES):
-        parts.append(FrameFile(file, content, frames_in(content, file, TEST_FRAMES)))
-    return without_shared(parts)
+        parts = _pair(path)
+    else:
+        content, frames = read_frames(file)
+        parts = [FrameFile(file, content, frames)]
+        if content.get(TEST_FRAMES):
+            parts.append(FrameFile(file, content, frames_in(content, file, TEST_FRAMES)))
+    refuse_twice([frame["file_path"] for part in parts for frame in part.frames], parts[-1].file)
+    return parts
 
 
 def _pair(folder: Path) -> list[FrameFile]:
@@ -48,18 +50,7 @@ def _pair(folder: Path) -> list[FrameFile]:
     listed = [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
     if not any(map(states_lens, (content, *listed))):
         raise InputError(f"'{folder}' has {TRAIN_FILE} and no {FILE}: it is a scene=blender folder.")
-    files = [folder / TRAIN_FILE, test_file(folder)]
-    return without_shared([FrameFile(file, *read_frames(file)) for file in files if file])
-
-
-def without_shared(parts: list[FrameFile]) -> list[FrameFile]:
-    """Return the parts.
-
-    Raises:
-        InputError: one image is in two of them.
-    """
-    refuse_twice([frame["file_path"] for part in parts for frame in part.frames], parts[-1].file)
-    return parts
+    return [FrameFile(file, *read_frames(file)) for file in (folder / TRAIN_FILE, test_file(folder)) if file]
 
 
 def test_file(folder: Path) -> Path | None:

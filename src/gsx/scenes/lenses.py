@@ -11,7 +11,7 @@ from gsx.core.data.images import image_size
 from gsx.core.data.resize import Size
 from gsx.core.errors import InputError, nearest
 from gsx.scenes.colmap_records import LARGEST_SIDE
-from gsx.scenes.posed import finite_number
+from gsx.scenes.pose_files import finite_number
 
 BENDING = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 """Keys of what lenses do to straight lines; their meaning depends on the camera model."""
@@ -124,9 +124,8 @@ def lens_of(entry: Mapping[str, Any], photo: Path, place: str) -> Any:
     if model not in pycolmap.CameraModelId.__members__:
         raise InputError(f"{place} has camera_model {name}, which pycolmap {pycolmap.__version__} lacks: upgrade it.")
     camera = pycolmap.Camera.create_from_model_name(1, model, focal[0], width, height)
-    params = [*focal, *centre, *bend]
     count = len(camera.params)
-    camera.params = (params + [0.0] * count)[:count]
+    camera.params = [*focal, *centre, *bend, *[0.0] * count][:count]
     return camera
 
 
@@ -163,13 +162,10 @@ def _distortion(entry: Mapping[str, Any], name: str, place: str) -> list[float]:
             "undistort the photos" if name == "OPENCV" else "set camera_model to the lens that has it, or remove it"
         )
         raise InputError(
-            f"{place} is {name} and has distortion {', '.join(odd)}, of which that has {_listed(keys)}: {remedy}."
+            f"{place} is {name} and has distortion {', '.join(odd)}, of which that has {', '.join(keys) or 'none'}: "
+            f"{remedy}."
         )
     return _parameters(entry, place) if keys == (PARAMETERS,) else [_number(entry, key, 0.0, place) for key in keys]
-
-
-def _listed(keys: tuple[str, ...]) -> str:
-    return ", ".join(keys) or "none"
 
 
 def _parameters(entry: Mapping[str, Any], place: str) -> list[float]:
@@ -203,18 +199,14 @@ def _focal(entry: Mapping[str, Any], name: str, width: int, height: int, place: 
 
 def _focal_of(entry: Mapping[str, Any], axis: str, side: int, name: str, place: str) -> float:
     """Return the focal length of one axis in pixels by the first key that states it; NaN where none does."""
-    degrees, pixels, radians = FOCAL[axis]
-    if entry.get(degrees) is not None:
-        return _focal_of_angle(math.radians(_number(entry, degrees, math.nan, place)), degrees, side, name, place)
-    focal = _number(entry, pixels, math.nan, place)
-    if not math.isnan(focal) or entry.get(radians) is None:
-        return focal
-    return _focal_of_angle(_number(entry, radians, math.nan, place), radians, side, name, place)
-
-
-def _focal_of_angle(angle: float, key: str, side: int, name: str, place: str) -> float:
+    degrees, pixels, _ = FOCAL[axis]
+    key = next((key for key in FOCAL[axis] if entry.get(key) is not None), pixels)
+    value = _number(entry, key, math.nan, place)
+    if key == pixels:
+        return value
     if LENSES[name].fisheye:
         raise InputError(f"{place} is {name}, whose focal length {key} does not give: add it in pixels as fl_x.")
+    angle = math.radians(value) if key == degrees else value
     if angle / 2 <= 0 or angle >= math.pi:  # its half is what the tangent is taken of
         raise InputError(f"{place} has {key} {angle:g}, no angle between 0 and pi: give fl_x and fl_y instead.")
     return side / (2 * math.tan(angle / 2))

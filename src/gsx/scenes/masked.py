@@ -13,9 +13,9 @@ from gsx.core.data.resize import Size
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError
 from gsx.core.files import at_home, is_file
-from gsx.scenes.frame_names import SUFFIXES
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.orientation import INVERSES, Turns, oriented_size
+from gsx.scenes.photo_names import SUFFIXES
 from gsx.scenes.undistort import StoredUndistortion
 
 IMAGES = "images"
@@ -27,13 +27,13 @@ FOLDER = "masks"
 def mask_of(
     photo: Path,
     name: str,
-    given: Path | None,
+    stated: Path | None,
     remap: StoredUndistortion | None,
     expected: Size,
     options: SceneOptions,
     turns: Turns,
 ) -> Mask | None:
-    """The mask of a photograph of that name; None: it has none. `expected`: (width, height) of its camera's raster.
+    """Return the mask of a photograph of that name; None: it has none. `expected`: size of its camera's raster, px.
 
     Raises:
         InputError: a mask that the scene names is not there, or has another shape than its photograph.
@@ -42,12 +42,10 @@ def mask_of(
         return None
     if options.masks == "alpha":
         return masking(photo, remap, turns, alpha=True) if has_alpha(photo) else None
-    if given is not None and not is_file(given):
-        raise InputError(f"The mask '{given}' of '{photo}' does not exist: restore it, or set scene.masks=none.")
-    found = (
-        path for path in candidates(folder_of(options), name) if is_file(path) and path.resolve() != photo.resolve()
-    )
-    path = given or next(found, None)
+    if stated is not None and not is_file(stated):
+        raise InputError(f"The mask '{stated}' of '{photo}' does not exist: restore it, or set scene.masks=none.")
+    files = filter(is_file, candidates(folder_of(options), name))
+    path = stated or next((file for file in files if file.resolve() != photo.resolve()), None)
     if path is None:
         return None
     bent = None if remap is None else replace(remap, photo=path)
@@ -83,7 +81,7 @@ def to_stored(mask: Path, turns: Turns, raster: Size) -> tuple[int, ...]:
 
 
 def folder_of(options: SceneOptions) -> Path:
-    """Where masks are looked for: in the scene's folder, or beside it where that may be the photographs' own."""
+    """Return the folder of masks: in the scene's folder, or next to it where that may be the photographs' own."""
     path = at_home(options.path)
     own, beside = path / FOLDER, path.parent / FOLDER
     photographs = options.name == "photos" and not (path / IMAGES).is_dir()
@@ -91,8 +89,10 @@ def folder_of(options: SceneOptions) -> Path:
 
 
 def candidates(folder: Path, name: str) -> list[Path]:
-    """Files that may be the mask of a photograph: NAME.png (COLMAP), NAME, or NAME with another suffix; below the same
-    folders, or without the first of them."""
+    """Return files that may be the mask of a photograph: NAME.png (COLMAP), NAME, or NAME with another suffix.
+
+    They lie below the same folders, or without the first of them.
+    """
     parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..")]
     names = dict.fromkeys(PurePosixPath(*parts[first:]) for first in range(min(len(parts), 2)))
     forms = [(f"{one}.png", str(one), *(str(one.with_suffix(suffix)) for suffix in SUFFIXES)) for one in names]
@@ -100,7 +100,7 @@ def candidates(folder: Path, name: str) -> list[Path]:
 
 
 def mask_notes(views: Sequence[View], options: SceneOptions) -> list[str]:
-    """How many photographs have a mask.
+    """Return how many photographs have a mask, in a note.
 
     Raises:
         InputError: there are masks, and none belongs to a photograph.
@@ -123,22 +123,19 @@ def mask_notes(views: Sequence[View], options: SceneOptions) -> list[str]:
 
 
 def masks_of(views: Sequence[View]) -> list[tuple[str, Mask]]:
-    """(name, mask) of the photographs that have one."""
+    """Return (name, mask) of the photographs that have one."""
     sources = ((view.name, view.source) for view in views)
     masks = ((name, source.mask) for name, source in sources if isinstance(source, PhotoSource))
     return [(name, mask) for name, mask in masks if mask is not None]
 
 
 def masks_named(views: Sequence[View]) -> Mapping[str, Any]:
-    """For the provenance; nothing without masks, so that such a protocol keeps its hash."""
-    found = masks_of(views)
-    return {"masks": len(found), "masks_content": content_of(found)} if found else {}
+    """Return the number and a digest of masks for the provenance; nothing without any: such protocols keep their hash.
 
-
-def content_of(masks: Sequence[tuple[str, Mask]]) -> str:
-    """A digest of the files of masks, view by view; those that are the alpha of photographs are these' own."""
-    digest = hashlib.sha256()
+    Masks that are the alpha of photographs count by name alone.
+    """
+    masks, digest = masks_of(views), hashlib.sha256()
     for name, mask in masks:
         digest.update(repr((name, mask.alpha)).encode())
         digest.update(b"" if mask.alpha else mask.path.read_bytes())
-    return digest.hexdigest()[:16]
+    return {"masks": len(masks), "masks_content": digest.hexdigest()[:16]} if masks else {}

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsx.core.shapes import Bool, Float
 from gsx.scenes.colmap_model import Model, ModelImage
-from gsx.scenes.posed import named
+from gsx.scenes.pose_files import some_names
 from gsx.scenes.undistort import pinhole_of, undistort_points
 
 
@@ -32,16 +32,13 @@ class Unmeasured:
         if self.no_ray:
             yield f"keypoints for which the lens has no ray, left out: {self.no_ray}"
         if self.blind:
-            yield f"no keypoint is left of {named(self.blind)}"
+            yield f"no keypoint is left of {some_names(self.blind)}"
         if self.behind:
             yield f"observed points that lie behind their camera: {self.behind}"
 
 
 def straight_keypoints(image: ModelImage, intrinsics: Any) -> Float[Tensor, "K 2"]:
-    """Return the keypoints in px of the image's pinhole camera; NaN for those without a ray.
-
-    `intrinsics` is the model's pycolmap camera.
-    """
+    """Return the keypoints in px of the pinhole of `intrinsics`, a pycolmap camera; NaN for those without a ray."""
     return undistort_points(intrinsics, pinhole_of(intrinsics), image.keypoints)
 
 
@@ -51,11 +48,7 @@ def known(pixels: Float[Tensor, "K 2"]) -> Bool[Tensor, "K"]:
 
 
 def unmeasured(model: Model) -> Unmeasured:
-    """Return how many of the observations of a model cannot be measured.
-
-    Raises:
-        InputError: a lens has no pinhole equivalent.
-    """
+    """Return how many of the observations of a model cannot be measured; InputError as `pinhole_of`."""
     rays = [known(straight_keypoints(image, model.cameras[image.camera_id])) for image in model.images]
     ahead = [(image.observed @ image.rotation.T + image.translation)[:, 2] > 0 for image in model.images]
     return counted([image.name for image in model.images], rays, [~one for one in ahead])

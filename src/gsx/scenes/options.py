@@ -1,4 +1,4 @@
-"""What every loader of photographs can be told; the values and their sources are in conf/scene/*.yaml."""
+"""Options common to all loaders of photographs; values and sources are in conf/scene/*.yaml."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ WORDS = {
     "masks": ("auto", "alpha", "none"),
     "orientation": ("auto", "stored", "turned"),
 }
-"""What options of any scene may be."""
+"""Values of options that are words."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,39 +43,36 @@ class SceneOptions:
     principal_point: str = "exact"
     """exact | centred; centred ignores the measured principal point, as 3D-GS does (3D-GS, dataset_readers.py)."""
     unit: Annotated[float, Range(1e-9, 1e9)] = 1.0
-    """Positions of cameras and points are multiplied by this when the scene is loaded; published constants (near plane
-    0.2, least distances, limits of scales) expect scenes of a few units."""
+    """Factor of all positions; published constants (near plane 0.2, limits of scales) expect scenes of a few units."""
     fill: Annotated[int, Range(0, 10**8)] = 0
     """Points that are added where training views show none (gsx.scenes.filling); 0: none."""
     disturb: Annotated[dict[str, float], Range(0, 64)] = field(
         default_factory=lambda: {"exposure": 0.0, "shade": 0.0, "pose": 0.0, "blur": 0.0, "covered": 0.0, "some": 1.0}
     )
-    """What training photographs are made to suffer, for research (gsx.experiments.runs.degraded); 0: nothing."""
+    """How training photographs are degraded, for research (gsx.experiments.runs.degraded); 0: not."""
     cache_gb: Gigabytes = without_effect(default=2.0)
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
     missing: Share = without_effect(default=0.1)
-    """Share of the images named by a file of poses that may be absent from the disk, or of photographs that may be
-    unreadable; more are refused."""
+    """Share of the images that may be absent or unreadable; more are refused."""
     masks: str = "auto"
     """Which pixels of photographs count. auto: what the scene names (`mask_path` of nerfstudio), else files in a folder
     `masks`; alpha: what is opaque counts, instead of compositing the rest; none: all pixels (gsx.scenes.masked)."""
     orientation: str = "auto"
-    """Use of EXIF's orientation by scene=photos, colmap and transforms. auto: photos and cameras are turned upright,
-    from the raster that cameras are stated for: the stored one, or the turned one where only that has their shape;
-    stored: not at all; turned: as auto, but the cameras are stated for turned photos of any shape
-    (gsx.scenes.orientation)."""
+    """Use of EXIF's orientation by scene=photos, colmap and transforms (gsx.scenes.orientation). auto: photos and
+    cameras are turned upright from the raster for which cameras are stated: the stored one, or the turned one where
+    only that has their shape; stored: not at all; turned: cameras are stated for turned photos of any shape."""
     split: str = "every:8"
-    """every:K | sharp:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST | none: all are trained on, and nothing is
-    measured (gsx.scenes.splits)."""
+    """every:K | sharp:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST | none: train on all, measure nothing
+    (gsx.scenes.splits)."""
+
+    def __post_init__(self) -> None:
+        for key, words in WORDS.items():
+            refuse_other(key, getattr(self, key), words)
+        if len(self.background) != 3:
+            raise ConfigError(f"scene.background is {list(self.background)}, give red, green and blue in [0, 1].")
 
 
-def refuse_unknown(options: SceneOptions) -> None:
-    """Raise ConfigError for a word that is none of its option's values."""
-    for key, known in WORDS.items():
-        refuse_other(key, getattr(options, key), known)
-
-
-def refuse_other(key: str, word: str, known: Sequence[str]) -> None:
-    """Raise ConfigError for a word that is none of those that an option of scenes knows."""
-    if word not in known:
-        raise ConfigError(f"scene.{key} is '{word}', use one of {', '.join(known)}.{nearest(word, known)}")
+def refuse_other(key: str, word: str, words: Sequence[str]) -> None:
+    """Raise ConfigError for a word that is none of an option's values."""
+    if word not in words:
+        raise ConfigError(f"scene.{key} is '{word}', use one of {', '.join(words)}.{nearest(word, words)}")

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.scene import Scene, View
+from gsx.core.data.scene import Scene
 from gsx.core.shapes import Float
 from gsx.formats.origin import NO_ORIGIN, Origin, chosen_origin, in_words, rounding_at, stored_in_single
 
@@ -20,13 +20,9 @@ def origin_of(scene: Scene) -> Origin:
     views = [*scene.train, *scene.test]
     if any(view.file is None for view in views):
         return NO_ORIGIN
-    cameras = [view.camera for view in views]
-    return origin_of_cameras(cameras, depth_of(scene.points.positions, cameras[0].centre))
-
-
-def depth_of(positions: Float[Tensor, "P 3"], centre: Float[Tensor, "3"]) -> float:
-    """Return the median distance of points from a place; 0 without points."""
-    return float((positions.double() - centre.double()).norm(dim=1).median()) if len(positions) else 0.0
+    cameras, positions = [view.camera for view in views], scene.points.positions.double()
+    distances = (positions - cameras[0].centre.double()).norm(dim=1)
+    return origin_of_cameras(cameras, float(distances.median()) if len(positions) else 0.0)
 
 
 def origin_of_cameras(cameras: Sequence[Camera], least: float = 0.0) -> Origin:
@@ -44,8 +40,8 @@ def around_origin(scene: Scene, origin: Origin) -> Scene:
     return replace(
         scene,
         origin=origin,
-        train=[seen_from(view, origin) for view in scene.train],
-        test=[seen_from(view, origin) for view in scene.test],
+        train=[replace(view, camera=moved(view.camera, origin)) for view in scene.train],
+        test=[replace(view, camera=moved(view.camera, origin)) for view in scene.test],
         points=points,
         notes=[*scene.notes, *notes_on(scene, origin)],
     )
@@ -54,11 +50,6 @@ def around_origin(scene: Scene, origin: Origin) -> Scene:
 def relative(positions: Float[Tensor, "P 3"], origin: Sequence[float]) -> Float[Tensor, "P 3"]:
     """Return positions - origin, float64; without an origin the same tensor."""
     return positions.double() - torch.tensor(origin, dtype=torch.float64) if any(origin) else positions
-
-
-def seen_from(view: View, origin: Sequence[float]) -> View:
-    """Return the view with its camera's position relative to an origin."""
-    return replace(view, camera=moved(view.camera, origin))
 
 
 def moved(camera: Camera, origin: Sequence[float]) -> Camera:

@@ -41,16 +41,10 @@ def refuse_passed_over(path: Path) -> Mapping[str, str]:
 
 def _models_below(path: Path) -> Iterator[str]:
     for folder in unusual_model_folders(path):
-        name = place(path, folder)
-        yield f"a COLMAP model in {name}{_count(folder)}: train from it by scene=colmap scene.path={path} " + (
-            f"scene.model={name}"
-        )
-
-
-def _count(folder: Path) -> str:
-    with suppress(InputError):
-        return f" ({count_images(folder)} images)"
-    return ""
+        name, count = place(path, folder), ""
+        with suppress(InputError):
+            count = f" ({count_images(folder)} images)"
+        yield f"a COLMAP model in {name}{count}: train from it by scene=colmap scene.path={path} scene.model={name}"
 
 
 def _transforms_below(path: Path) -> Iterator[str]:

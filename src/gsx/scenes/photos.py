@@ -16,27 +16,19 @@ from gsx.core.ranges import Range
 from gsx.engine.cache import cache_folder, content_key, file_stamp
 from gsx.formats.suffixes import is_sog_folder
 from gsx.scenes import colmap, sfm, sfm_copies
-from gsx.scenes.colmap_model import Model, error_told, read_model
+from gsx.scenes.colmap_model import Model, error_words, read_model
 from gsx.scenes.exif import NO_LENS, lens_of, orientation_of
 from gsx.scenes.kept_models import intact, kept_model
 from gsx.scenes.masked import FOLDER, IMAGES
 from gsx.scenes.options import SceneOptions, refuse_other
 from gsx.scenes.orientation import ON_SIDE, as_stored, of_own_model, oriented_size
 from gsx.scenes.passed_models import refuse_passed_over
-from gsx.scenes.posed import named, refuse_partial
+from gsx.scenes.pose_files import refuse_partial, some_names
 from gsx.scenes.readable import readable_size
 
 logger = logging.getLogger(__name__)
 
-PHOTO_SUFFIXES = (
-    ".jpg",
-    ".jpeg",
-    ".png",
-    ".tif",
-    ".tiff",
-    ".bmp",
-    ".webp",
-)
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 """Suffixes that gsx reads; COLMAP gets copies of photos that it reads otherwise (gsx.scenes.sfm_copies)."""
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw")
 FOREIGN = {".heic": "HEIC", ".heif": "HEIC", ".hif": "HEIC", ".avif": "AVIF"} | dict.fromkeys(RAW, "raw")
@@ -59,7 +51,7 @@ COPIES = "copies/1"  # likewise, where photos are converted for COLMAP
 
 @dataclass(frozen=True, kw_only=True)
 class PhotosOptions(SceneOptions, sfm.SfmOptions):
-    """What `conf/scene/photos.yaml` sets."""
+    """Options of `conf/scene/photos.yaml`."""
 
     max_reprojection_px: Annotated[float, Range(0, 1e6)]
     """As for scene=colmap."""
@@ -74,7 +66,6 @@ def load(options: PhotosOptions) -> Scene:
             cannot be reconstructed.
     """
     refuse_unknown(options)
-    refuse_other("orientation", options.orientation, tuple(RULES))
     path = at_home(options.path)
     folder, photos = find_photos(path)
     sizes, notes = readable_sizes(folder, photos)
@@ -83,23 +74,25 @@ def load(options: PhotosOptions) -> Scene:
     refuse_partial(broken, len(photos), folder, options.missing, "cannot be read", remedy_of(folder, broken))
     model = read_model(reconstruct(folder, sizes, options, options.orientation))
     notes += report(model, list(sizes))
-    scene = colmap.build(model, folder, _colmap_options(options, folder), notes, RULES[options.orientation])
+    common = {field.name: getattr(options, field.name) for field in fields(SceneOptions)}
+    as_model = colmap.ColmapOptions(**common, images=folder.name, max_reprojection_px=options.max_reprojection_px)
+    scene = colmap.build(model, folder, as_model, notes, RULES[options.orientation])
     name = folder.resolve().parent.name if folder.name == IMAGES else folder.resolve().name
     return replace(scene, name=name, provenance=scene.provenance | {"sfm": settings(options)})
 
 
-def refuse_unknown(options: sfm.SfmOptions) -> None:
+def refuse_unknown(options: PhotosOptions) -> None:
     """Raise ConfigError for a word that is none of its option's values."""
     import pycolmap
 
     models = [name for name in pycolmap.CameraModelId.__members__ if name not in ("INVALID", "EQUIRECTANGULAR")]
-    choices = {"matcher": MATCHERS, "camera_mode": CAMERA_MODES, "camera_model": models}
-    for key, known in choices.items():
+    words = {"matcher": MATCHERS, "camera_mode": CAMERA_MODES, "camera_model": models, "orientation": tuple(RULES)}
+    for key, known in words.items():
         refuse_other(key, getattr(options, key), known)
 
 
 def find_photos(path: Path) -> tuple[Path, list[str]]:
-    """The folder with the photos (`path`, else `path`/images) and their names relative to it, sorted.
+    """Return the folder with the photos (`path`, else `path`/images) and their sorted names relative to it.
 
     Raises:
         InputError: there is no such folder, or it has fewer than two photos.
@@ -122,21 +115,20 @@ def find_photos(path: Path) -> tuple[Path, list[str]]:
 
 
 def passed_over(path: Path, folder: Path) -> list[str]:
-    """A note where photos are taken from a folder's top, and there are others where a scene has its own."""
+    """Return a note where photos are taken from a folder's top, and there are others in its folder of images."""
     others = len(photos_in(path / IMAGES, "**/*")) if folder == path and (path / IMAGES).is_dir() else 0
     used = f"{others} photos in {IMAGES} are not used, as there are some in {path}"
     return [f"{used}: set scene.path to the folder that is meant."] if others else []
 
 
 def photos_in(folder: Path, pattern: str) -> list[str]:
-    """Sorted names of photos below `folder` that match `pattern`; masks do not count, nor what is hidden or beside
-    photos by another program."""
+    """Return sorted names of photos below `folder` that match `pattern`, without masks and what `aside` leaves out."""
     files = (file.relative_to(folder) for file in folder.glob(pattern) if file.suffix.lower() in PHOTO_SUFFIXES)
     return sorted(file.as_posix() for file in files if file.parts[0] != FOLDER and not any(map(aside, file.parts)))
 
 
 def aside(name: str) -> bool:
-    """Whether a file or folder is none of a user's own: hidden, or thumbnails and attributes of a NAS or of macOS."""
+    """Return whether a file or folder is none of a user's own: hidden, or thumbnails of a NAS or of macOS."""
     return name.startswith(".") or name in ("@eaDir", "__MACOSX")
 
 
@@ -153,7 +145,7 @@ def foreign_sentences(folder: Path) -> list[str]:
 
 
 def readable_sizes(folder: Path, photos: Sequence[str]) -> tuple[dict[str, tuple[int, int]], list[str]]:
-    """Sizes of the photos by name, without those that cannot be read, and a note on the latter.
+    """Return sizes of the photos by name, without those that cannot be read, and notes on what is passed over.
 
     Raises:
         InputError: fewer than two photos can be read.
@@ -169,7 +161,7 @@ def readable_sizes(folder: Path, photos: Sequence[str]) -> tuple[dict[str, tuple
         raise InputError(
             f"Only {len(sizes)} of the {len(photos)} photos in {folder} can be read: {remedy_of(folder, broken)}."
         )
-    notes = [f"Skipped {len(broken)} photos that cannot be read: {named(broken)}."] if broken else []
+    notes = [f"Skipped {len(broken)} photos that cannot be read: {some_names(broken)}."] if broken else []
     return sizes, [*notes, *(f"Passed over {sentence}" for sentence in foreign_sentences(folder))]
 
 
@@ -184,12 +176,9 @@ def remedy_of(folder: Path, broken: Sequence[str]) -> str:
 
 
 def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions, orientation: str = "auto") -> Path:
-    """The folder with the model of these photos: computed once, then found in the cache.
+    """Return the folder with the model of these photos, computed once; InputError: no two photos can be placed.
 
     `orientation`: one of `RULES`.
-
-    Raises:
-        InputError: no two photos can be placed.
     """
     first = {name: RULES[orientation](folder / name, size).first for name, size in sizes.items()}
     first |= turned_already(folder, sizes, options.camera_mode) if orientation == "auto" else {}
@@ -202,8 +191,12 @@ def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions, orienta
 
     def make(work: Path) -> Any:
         best = sfm.reconstruct(sfm_copies.prepared(folder, list(sizes), doubtful, work), rasters, options, work)
-        _refuse_nothing(best, folder, sizes)
-        return best
+        if best is not None and best.num_reg_images() >= MIN_PHOTOS:
+            return best
+        raise InputError(
+            f"None of the {len(sizes)} photos in {folder} could be placed: they need texture, 60 to 80 % overlap and a "
+            "camera that moves between shots; try scene.matcher=exhaustive or a larger scene.max_feature_size."
+        )
 
     return kept_model(final, make)
 
@@ -232,45 +225,29 @@ def _key(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions, doubtful: Mapp
 
 
 def settings(options: sfm.SfmOptions) -> dict[str, Any]:
-    """The options that the reconstruction depends on."""
+    """Return the options that the reconstruction depends on."""
     deciding = {field.name for field in fields(sfm.SfmOptions)} - {"num_threads"}
     return {key: value for key, value in asdict(options).items() if key in deciding}
 
 
 def report(model: Model, photos: Sequence[str]) -> list[str]:
-    """What became of the photos, in sentences."""
+    """Return what became of the photos, in sentences."""
     lost = sorted(set(photos) - {image.name for image in model.images})
     placed = (
         f"Reconstructed {len(model.images)} of {len(photos)} photos: {len(model.points)} points, "
-        f"{error_told(model.mean_error)}."
+        f"{error_words(model.mean_error)}."
     )
-    return (
-        [placed, f"Photos that could not be placed are not used ({len(lost)}): {', '.join(lost)}."]
-        if lost
-        else [placed]
-    )
-
-
-def _refuse_nothing(best: Any, folder: Path, sizes: sfm.Sizes) -> None:
-    if best is None or best.num_reg_images() < MIN_PHOTOS:
-        raise InputError(
-            f"None of the {len(sizes)} photos in {folder} could be placed: they need texture, 60 to 80 % overlap and a "
-            "camera that moves between shots; try scene.matcher=exhaustive or a larger scene.max_feature_size."
-        )
-
-
-def _colmap_options(options: PhotosOptions, folder: Path) -> colmap.ColmapOptions:
-    common = {field.name: getattr(options, field.name) for field in fields(SceneOptions)}
-    return colmap.ColmapOptions(**common, images=folder.name, max_reprojection_px=options.max_reprojection_px)
+    unused = f"Photos that could not be placed are not used ({len(lost)}): {', '.join(lost)}."
+    return [placed, unused] if lost else [placed]
 
 
 def recognise(path: Path) -> bool:
-    """Whether there are photographs in it, or in its folder `images`."""
+    """Return whether there are photographs in a folder, or in its folder `images`."""
     return path.is_dir() and bool(photos_in(path, "*") or photos_in(path / IMAGES, "**/*"))
 
 
 def facts(path: Path) -> Iterator[str]:
-    """Sizes of the photographs, and what is odd about them."""
+    """Yield lines on sizes of the photographs, and what is odd about them."""
     folder, names = find_photos(path)
     sizes, notes = readable_sizes(folder, names)
     for (width, height), count in sorted(Counter(sizes.values()).items()):

@@ -26,22 +26,19 @@ GREY = 127  # colour of points without one: the published random clouds store th
 def random_points(
     count: int, low: Float[Tensor, "3"], high: Float[Tensor, "3"], generator: torch.Generator
 ) -> PointCloud:
-    """`count` grey points, uniform in the box from `low` to `high`.
-
-    Raises:
-        InputError: `count` is below 1 or the box has no volume.
-    """
-    if count < 1 or not bool((low < high).all()):
-        raise InputError(
-            f"{count} random points in the box {low.tolist()} to {high.tolist()} cannot start a scene: set"
-            " scene.random_points to at least 1, or scene.points to a PLY file."
-        )
+    """Return `count` grey points, uniform in the box from `low` to `high`."""
     return grey_points(low + (high - low) * torch.rand(count, 3, generator=generator, dtype=torch.float64))
 
 
 def grey_points(positions: Float[Tensor, "P 3"]) -> PointCloud:
-    """Points without a colour of their own."""
+    """Return points without a colour of their own."""
     return PointCloud(in_single_where_resolved(positions), torch.full((len(positions), 3), GREY, dtype=torch.uint8))
+
+
+def stored_points(folder: Path, name: str) -> tuple[PointCloud, str]:
+    """Return the points of a PLY file, and a note that says so; InputError as `read_points`."""
+    cloud = read_points(folder / name)
+    return cloud, f"Starts from the {len(cloud)} points of {name}."
 
 
 def read_points(path: Path) -> PointCloud:
@@ -64,17 +61,15 @@ def read_points(path: Path) -> PointCloud:
 
 
 def colours_in(columns: Mapping[str, np.ndarray]) -> UInt8[Tensor, "P 3"] | None:
-    """Return the display RGB of points by the columns of their file; None: they have none that can be read.
-
-    Points whose colour is not finite are grey.
-    """
+    """Return the display RGB of points by the columns of their file, grey where not finite; None: none can be read."""
     values = colours_among(columns)
     if values is None and set(CONSTANT_BAND) <= columns.keys():  # a splat file
         values = (0.5 + BAND_0 * np.stack([columns[name] for name in CONSTANT_BAND], 1)).clip(0, 1)
-    full = None if values is None else full_scale_of(values)
-    if values is None or full is None:
-        if values is not None:
-            logger.warning("colours from %g to %g are of no known unit: points are grey", values.min(), values.max())
+    if values is None:
+        return None
+    full = full_scale_of(values)
+    if full is None:
+        logger.warning("colours from %g to %g are of no known unit: points are grey", values.min(), values.max())
         return None
     if values.dtype == np.uint8:
         return torch.from_numpy(values)

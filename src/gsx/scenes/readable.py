@@ -47,10 +47,8 @@ def decodes(reader: Any, spec: Any, last: bool) -> bool:
     """Return whether the first or the last row or tile of a picture can be decoded."""
     if not spec.tile_width:
         return reader.read_scanline(spec.y + last * (spec.height - 1), spec.z, spec.format) is not None
-    x, y = (
-        last * (side - 1) // tile * tile
-        for side, tile in ((spec.width, spec.tile_width), (spec.height, spec.tile_height))
-    )
+    sides = (spec.width, spec.tile_width), (spec.height, spec.tile_height)
+    x, y = (last * (side - 1) // tile * tile for side, tile in sides)
     return reader.read_tile(spec.x + x, spec.y + y, spec.z, spec.format) is not None
 
 

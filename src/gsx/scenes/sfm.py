@@ -116,9 +116,13 @@ def _extract(database: Path, folder: Path, sizes: Sizes, options: SfmOptions) ->
 
     def work(token: Any) -> None:
         pycolmap.extract_features(
-            database, folder, image_names=sorted(sizes), extraction_options=extraction, device=pycolmap.Device.cpu,
+            database,
+            folder,
+            image_names=sorted(sizes),
+            extraction_options=extraction,
+            device=pycolmap.Device.cpu,
             cancellation_token=token,
-        )  # fmt: skip
+        )
 
     with pycolmap.Database.open(database) as reader:
         numbers = [image.image_id for image in reader.read_all_images()]

@@ -10,13 +10,10 @@ import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from gsx.core.data.images import header_of, open_image, read_image, write_image
-from gsx.core.shapes import UInt8
 from gsx.scenes.orientation import oriented
 
 logger = logging.getLogger(__name__)
@@ -92,16 +89,7 @@ def copy(photo: Path, place: Path, orientation: int) -> None:
     """Write the colours of a photo as PNG of 8 bits, turned by an EXIF orientation, with its lens's EXIF."""
     place.parent.mkdir(parents=True, exist_ok=True)
     written = place.with_name(f".{place.name}.png")  # hidden files are no photos: it replaces none
-    write_image(written, colours_of(photo, orientation), lens_attributes(photo))
+    header = header_of(photo)
+    lens = {name: value for name in KEPT if (value := header.getattribute(name)) is not None}
+    write_image(written, oriented(read_image(photo)[:3], orientation), lens)
     os.replace(written, place)
-
-
-def colours_of(photo: Path, orientation: int) -> UInt8[Tensor, "3 h w"]:
-    """Return the decoded photo without alpha, turned."""
-    return oriented(read_image(photo)[:3], orientation)
-
-
-def lens_attributes(photo: Path) -> dict[str, Any]:
-    """Return those of `KEPT` that a photo states."""
-    values = ((name, header_of(photo).getattribute(name)) for name in KEPT)
-    return {name: value for name, value in values if value is not None}

@@ -15,7 +15,7 @@ Split = tuple[list[int], list[int]]
 
 
 def split_names(names: list[str], rule: str, folder: Path = Path(), photographs: Sequence[Path] = ()) -> Split:
-    """Splits `names` after sorting them; photographs: their files, in the same order, for rules that look at them.
+    """Split `names` after sorting them; photographs: their files, in the same order, for rules that look at them.
 
     `every:K`: of the sorted names, those at positions 0, K, 2K, ... are test, as published for K = 8.
     `sharp:K`: of every K of them the one that is the sharpest beside its neighbours.
@@ -27,55 +27,57 @@ def split_names(names: list[str], rule: str, folder: Path = Path(), photographs:
         ConfigError: the rule cannot be read, or looks at photographs where there are none.
         InputError: a split file or a photograph is unusable, or the rule leaves none to train on or none to test on.
     """
-    check_rule(rule)
-    kind, _, argument = rule.partition(":")
+    kind, values = parse_rule(rule)
     order = sorted(range(len(names)), key=lambda i: sort_key(names[i]))
     train, test = order, list[int]()
     if kind == "every":
-        k = _count(argument, rule)
-        train, test = [i for position, i in enumerate(order) if position % k], order[::k]
+        train, test = [i for position, i in enumerate(order) if position % values[0]], order[:: values[0]]
     elif kind == "sharp":
-        train, test = _sharp(order, photographs, _count(argument, rule), rule)
+        train, test = _sharp(order, photographs, values[0], rule)
     elif kind == "counts":
-        train, test = _counts(order, *(_count(count, rule) for count in _pair(argument, rule)))
+        train, test = _counts(order, *values)
     elif kind == "files":
-        train, test = _files(names, *(folder / part for part in _pair(argument, rule)))
-    _refuse_empty(len(names), len(train), len(test), rule)
+        train, test = _files(names, *(folder / part for part in _pair(rule)))
+    if not train or not (test or rule == "none"):
+        raise InputError(
+            f"scene.split '{rule}' makes {len(train)} training and {len(test)} test images of {len(names)}, both need "
+            "at least one: add images or choose another rule; scene.split=none trains on all."
+        )
     return train, test
 
 
-def check_rule(rule: str) -> None:
-    """Raise ConfigError for a rule that cannot be read, also where a scene has a split of its own."""
+def parse_rule(rule: str) -> tuple[str, list[int]]:
+    """Return the kind of a rule and its numbers; ConfigError: it cannot be read."""
     kind, _, argument = rule.partition(":")
     if kind in ("every", "sharp"):
-        _count(argument, rule)
-    elif kind == "counts":
-        for count in _pair(argument, rule):
-            _count(count, rule)
-    elif kind == "files":
-        _pair(argument, rule)
+        return kind, [_count(argument, rule)]
+    if kind == "counts":
+        return kind, [_count(count, rule) for count in _pair(rule)]
+    if kind == "files":
+        _pair(rule)
     elif rule != "none":
         raise ConfigError(f"scene.split is '{short(rule)}', use one of {', '.join(RULES)}.{nearest(rule, RULES)}")
+    return kind, []
 
 
 def positive(text: str) -> int | None:
-    """A whole number above 0; None for anything else, and for more digits than images have."""
+    """Return a whole number above 0; None for anything else, and for more digits than images have."""
     word = text.strip()
     return int(word) if word.isdecimal() and len(word) <= DIGITS and int(word) > 0 else None
 
 
 def short(text: str) -> str:
-    """As much of a text as an error has room for."""
+    """Return as much of a text as an error has room for."""
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 def sort_key(name: str) -> tuple[str, str]:
-    """Order of published splits: base name up to its first dot; the whole name decides between equal ones."""
+    """Return the key of published orders: base name up to its first dot; the whole name decides between equal ones."""
     return PurePosixPath(name).name.split(".")[0], name
 
 
 def _sharp(order: list[int], photographs: Sequence[Path], k: int, rule: str) -> Split:
-    """The sharpest of every `k` is test, the first of equals; one that tells nothing only among its like."""
+    """Take the sharpest of every `k` for a test, the first of equals; photos without a measure come last."""
     if len(photographs) != len(order):
         raise ConfigError(f"scene.split is '{rule}', and not each view has a photograph of its own: use every:{k}.")
     ratios = sharpness([photographs[i] for i in order])
@@ -129,8 +131,8 @@ def _find(names: list[str], word: str, file: Path) -> int:
     return hits[0]
 
 
-def _pair(argument: str, rule: str) -> list[str]:
-    parts = [part.strip() for part in argument.split(",")]
+def _pair(rule: str) -> list[str]:
+    parts = [part.strip() for part in rule.partition(":")[2].split(",")]
     if len(parts) != 2 or not all(parts):
         raise ConfigError(f"scene.split is '{short(rule)}' and needs two values separated by a comma after the colon.")
     return parts
@@ -143,12 +145,3 @@ def _count(text: str, rule: str) -> int:
             f"scene.split is '{short(rule)}' and '{short(text)}' in it is no positive whole number of images."
         )
     return count
-
-
-def _refuse_empty(total: int, train: int, test: int, rule: str) -> None:
-    """Raise InputError for a split without training images, or without test images unless the rule is `none`."""
-    if not train or not (test or rule == "none"):
-        raise InputError(
-            f"scene.split '{rule}' makes {train} training and {test} test images of {total}, both need at least"
-            " one: add images or choose another rule; scene.split=none trains on all."
-        )

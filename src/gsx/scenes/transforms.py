@@ -13,33 +13,21 @@ from typing import Any
 
 import torch
 
-from gsx.core.data.scene import PointCloud, Scene, View, extent_of
+from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError, nearest
 from gsx.core.files import at_home, is_file
 from gsx.core.ranges import Points, Seed
-from gsx.scenes.duplicates import photos_of, refuse_shared
+from gsx.scenes.duplicates import photos_of
 from gsx.scenes.frame_files import FILE, TEST_FILES, TRAIN_FILE, FrameFile, frame_files, is_empty, needs_lens, nodes
-from gsx.scenes.frame_names import plain_name
 from gsx.scenes.lenses import completed, lens_of
 from gsx.scenes.masked import mask_notes
-from gsx.scenes.options import SceneOptions, refuse_unknown
+from gsx.scenes.options import SceneOptions
 from gsx.scenes.orientation import RULES, TurnsOf
-from gsx.scenes.points import random_points, read_points
-from gsx.scenes.posed import (
-    SAME_PLACE,
-    Shot,
-    frames_line,
-    lens_notes,
-    pose_from_opengl,
-    present_frames,
-    provenance,
-    reduction_of,
-    refuse_too_few,
-    shot_through,
-    turn_notes,
-    views_of,
-)
+from gsx.scenes.photo_names import plain_name
+from gsx.scenes.points import random_points, stored_points
+from gsx.scenes.pose_files import frames_line, pose_from_opengl, present_frames
+from gsx.scenes.posed import SAME_PLACE, Shot, check_sides, scene_of, shot_notes, shot_through, views_of
 from gsx.scenes.splits import Split, split_names
 from gsx.scenes.undistort import METHOD
 
@@ -52,7 +40,7 @@ IGNORED = ("rolling_shutter", "transform_matrix_end", "white_transparent", "blac
 
 @dataclass(frozen=True, kw_only=True)
 class TransformsOptions(SceneOptions):
-    """What `conf/scene/transforms.yaml` sets; `path` is the folder of transforms.json, or such a file itself.
+    """Options of `conf/scene/transforms.yaml`; `path` is the folder of transforms.json, or such a file itself.
 
     `split` can be `json` as well: the file's own train_filenames and test_filenames, or its second file, else every:8.
     """
@@ -72,67 +60,48 @@ def load(options: TransformsOptions) -> Scene:
         InputError: a file is missing or damaged, a camera cannot be used, or there are fewer than two training images.
     """
     parts = frame_files(at_home(options.path))
-    file, content = parts[0].file, parts[0].content
-    refuse_unknown(options)
-    shots, notes = _shots(parts, options)
-    views = views_of([shot for part in shots for shot in part], options)
-    (train, test), split_notes = _split(parts, list(map(len, shots)), views, options.split)
-    refuse_too_few(train, file)
-    refuse_shared(train, test, file)
-    points, points_note = _points(content, views, options, file)
-    lenses, turned = (notes_of([shot for part in shots for shot in part]) for notes_of in (lens_notes, turn_notes))
-    return Scene(
-        name=file.parent.resolve().name,
-        train=train,
-        test=test,
-        points=points,
-        background=torch.tensor(list(options.background), dtype=torch.float32),
-        reduction=reduction_of(options),
-        extent=extent_of([view.camera for view in train]),
-        notes=[*notes, *lenses, *turned, *mask_notes(views, options), *split_notes, *_ignored(parts), points_note],
-        provenance=_provenance(options, views, parts, METHOD if lenses else None),
-    )
-
-
-def _provenance(
-    options: TransformsOptions, views: Sequence[View], parts: Sequence[FrameFile], method: str | None
-) -> dict[str, Any]:
-    """Return the provenance; the name of a second file is in it only where there is one: a protocol keeps its hash."""
+    by_part, notes = _shots(parts, options)
+    shots = [shot for part in by_part for shot in part]
+    views = views_of(shots, options)
+    sides, split_notes = _split(parts, list(map(len, by_part)), views, options.split)
+    check_sides(sides, parts[0].file)
+    points, points_note = _points(parts[0], views, options)
+    notes += [*shot_notes(shots), *mask_notes(views, options), *split_notes, *_ignored(parts), points_note]
     other = {"test_file": parts[-1].file.name} if parts[-1].file != parts[0].file else {}
-    return provenance(options, views, points=options.points, undistortion=method, **other)
+    bent = any(shot.remap is not None for shot in shots)
+    details = {"points": options.points, "undistortion": METHOD if bent else None, **other}
+    return scene_of(options, parts[0].file.parent, views, sides, points, notes, details)
 
 
 def _shots(parts: Sequence[FrameFile], options: TransformsOptions) -> tuple[list[list[Shot]], list[str]]:
     """Return the shots of each part whose photos are on disk, and notes on those that are not."""
-    shots, notes = list[list[Shot]](), list[str]()
+    shots, notes, rule = list[list[Shot]](), list[str](), RULES[options.orientation]
     for part in parts:
         present, absent = present_frames(part.file.parent, part.frames, part.file, options.missing)
-        rule = RULES[options.orientation]
         shots.append([_shot(completed(part.content, frame), photo, part.file, rule) for frame, photo in present])
         notes += absent
     return shots, notes
 
 
-def _ignored(parts: Sequence[FrameFile]) -> list[str]:
-    """Return a note on keys that change pictures in instant-ngp and nothing here."""
-    stated = sorted({key for part in parts for node in nodes(part) for key in IGNORED if has_value(node.get(key))})
-    named = ", ".join(stated)
-    return [f"{parts[0].file.name} states {named}: left out, photos are taken as they are."] if stated else []
-
-
-def has_value(value: Any) -> bool:
-    """Return whether a value of a file is none of 0, false, empty, and a list of zeros."""
-    return any(value) if isinstance(value, list) else bool(value)
-
-
 def _shot(entry: Mapping[str, Any], photo: Path, file: Path, turns_of: TurnsOf) -> Shot:
-    """A shot from a frame completed by the file's common values."""
+    """Return the shot of a frame completed by the file's common values."""
     name = plain_name(entry["file_path"])
     place = f"Frame '{name}' of '{file}'"
     rotation, translation = pose_from_opengl(entry.get("transform_matrix"), place)
     shot = shot_through(lens_of(entry, photo, place), name, photo, rotation, translation, turns_of)
     mask = entry.get("mask_path")
     return shot if mask is None else replace(shot, mask=file.parent / plain_name(str(mask)))
+
+
+def _ignored(parts: Sequence[FrameFile]) -> list[str]:
+    """Return a note on keys that change pictures in instant-ngp and nothing here."""
+    stated = sorted({key for part in parts for node in nodes(part) for key in IGNORED if _has_value(node.get(key))})
+    return [f"{parts[0].file.name} states {', '.join(stated)}: left out, photos are taken as they are."] * bool(stated)
+
+
+def _has_value(value: Any) -> bool:
+    """Return whether a value of a file is none of 0, false, empty, and a list of zeros."""
+    return any(value) if isinstance(value, list) else bool(value)
 
 
 def _split(
@@ -180,20 +149,17 @@ def _listed(content: Mapping[str, Any], key: str, known: set[str], file: Path) -
     if not isinstance(names, list):
         raise InputError(f"{key} of '{file}' is {reprlib.repr(names)}: give a list, or another scene.split.")
     listed = {plain_name(str(name)) for name in names}
-    unknown = sorted(listed - known)
-    if unknown:
+    if unknown := sorted(listed - known):
         raise InputError(f"{key} of '{file}' names {unknown[0]!r}, which is no frame.{nearest(unknown[0], known)}")
     return listed
 
 
-def _points(
-    content: Mapping[str, Any], views: Sequence[View], options: TransformsOptions, file: Path
-) -> tuple[PointCloud, str]:
-    """Points and a note on where they come from."""
-    stored = _stored(content, file) if options.points == "auto" else options.points
-    if stored is not None and stored != "random":
-        cloud = read_points(file.parent / stored)
-        return cloud, f"Starts from the {len(cloud)} points of {stored}."
+def _points(part: FrameFile, views: Sequence[View], options: TransformsOptions) -> tuple[PointCloud, str]:
+    """Return points and a note on their source."""
+    file = part.file
+    name = _stored(part.content, file) if options.points == "auto" else options.points
+    if name != "random":
+        return stored_points(file.parent, name)
     centres = torch.stack([view.camera.centre for view in views])
     low, high = centres.amin(0), centres.amax(0)
     middle, half = (low + high) / 2, (high - low).max() / 2
@@ -208,15 +174,17 @@ def _points(
     return cloud, f"Starts from {len(cloud)} random points in the cube around the cameras."
 
 
-def _stored(content: Mapping[str, Any], file: Path) -> str | None:
-    """Return the PLY file that a transforms file names, relative to its folder; None: it names none.
+def _stored(content: Mapping[str, Any], file: Path) -> str:
+    """Return the PLY file that a transforms file names, relative to its folder; `random`: it names none.
 
     Raises:
         InputError: there is no such file.
     """
     name = content.get("ply_file_path")
-    if name is None or (isinstance(name, str) and is_file(file.parent / plain_name(name))):
-        return None if name is None else plain_name(name)
+    if name is None:
+        return "random"
+    if isinstance(name, str) and is_file(file.parent / plain_name(name)):
+        return plain_name(name)
     raise InputError(
         f"ply_file_path {repr(name)[:200]} of '{file}' is no file there: restore it, or set scene.points=random."
     )

@@ -35,29 +35,8 @@ METHOD = "keys-cubic/1"  # part of the cache key: raise the number when the resa
 
 
 def is_pinhole(camera: Any) -> bool:
-    """Whether a pycolmap camera is a pinhole: by its model, or because all its distortion is zero."""
+    """Return whether a pycolmap camera is a pinhole: by its model, or because all its distortion is zero."""
     return bool(camera.is_perspective_pinhole() and camera.is_undistorted())
-
-
-def pinhole_of(camera: Any) -> Any:
-    """Return the pycolmap PINHOLE camera that a photo of `camera` is undistorted to; `camera` itself if it is one.
-
-    Raises:
-        InputError: the camera sees all round (EQUIRECTANGULAR), which no pinhole can, has a senseless distortion, or
-            has rays for too little of its photo.
-    """
-    if is_pinhole(camera) and np.isfinite(camera.params).all():  # to pycolmap distortion by no number is none
-        return camera
-    return undistorted(camera).pinhole
-
-
-def cut_of(camera: Any) -> Cut | None:
-    """Return what is cut off the photos of a pycolmap camera because its lens folds; None: nothing.
-
-    Raises:
-        InputError: as `pinhole_of`.
-    """
-    return None if is_pinhole(camera) else undistorted(camera).cut
 
 
 @dataclass(frozen=True)
@@ -70,13 +49,21 @@ class Undistorted:
     """Part of its photos that is kept; None: all but the borders that COLMAP trims."""
 
 
-def undistorted(camera: Any) -> Undistorted:
-    """Return what a distorted pycolmap camera is undistorted to.
+def pinhole_of(camera: Any) -> Any:
+    """Return the pycolmap PINHOLE camera that a photo of `camera` is undistorted to; `camera` itself if it is one.
 
     Raises:
-        InputError: as `pinhole_of`.
+        InputError: the camera sees all round (EQUIRECTANGULAR), which no pinhole can, has a senseless distortion, or
+            has rays for too little of its photo.
     """
-    return _undistorted(camera.model_name, camera.width, camera.height, tuple(camera.params.tolist()))
+    if is_pinhole(camera) and np.isfinite(camera.params).all():  # to pycolmap distortion by no number is none
+        return camera
+    return _undistorted(*_numbers(camera)).pinhole
+
+
+def cut_of(camera: Any) -> Cut | None:
+    """Return what is cut off a pycolmap camera's photos where its lens folds; None: nothing."""
+    return None if is_pinhole(camera) else _undistorted(*_numbers(camera)).cut
 
 
 @lru_cache(maxsize=1024)  # a lens is needed for each of its photos
@@ -111,7 +98,7 @@ def refuse_nonsense(camera: Any, pinhole: Any) -> None:
 
 
 def camera_of(pinhole: Any, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> Camera:
-    """A pycolmap pinhole camera with a pose camera_from_world as gsx has it, at the same resolution."""
+    """Return a pycolmap pinhole camera with a pose camera_from_world as gsx has it, at the same resolution."""
     return Camera(
         rotation=rotation,
         translation=translation,
@@ -125,7 +112,7 @@ def camera_of(pinhole: Any, rotation: Float[Tensor, "3 3"], translation: Float[T
 
 
 def undistorted_size(intrinsics: Any, pinhole: Any, size: tuple[int, int]) -> tuple[int, int]:
-    """(width, height) of the result for a photo of `size`, which may be reduced against the camera `intrinsics`."""
+    """Return the size of the result for a photo of `size`, which may be reduced against the camera `intrinsics`."""
     width, height = size
     return round(pinhole.width * width / intrinsics.width), round(pinhole.height * height / intrinsics.height)
 
@@ -157,7 +144,7 @@ def rays_of(intrinsics: Any, positions: Float[Tensor, "K 2"]) -> Float[Tensor, "
 def undistort(
     image: UInt8[Tensor, "C H W"], intrinsics: Any, pinhole: Any, size: tuple[int, int]
 ) -> UInt8[Tensor, "C h w"]:
-    """The photo `image` of the camera `intrinsics` as `pinhole` would have taken it, on a raster of `size`.
+    """Return the photo `image` of the camera `intrinsics` as `pinhole` would have taken it, on a raster of `size`.
 
     Both pycolmap cameras may be of another resolution than the photo and the result: only their fields of view count.
     """
@@ -170,18 +157,18 @@ def undistort(
 
 
 def premultiplied(photo: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
-    """Colours times alpha, where there is one: what is transparent has no colour to interpolate."""
+    """Multiply colours by alpha, if there is one: what is transparent has no colour to interpolate."""
     return photo if len(photo) < 4 else torch.cat([photo[:3] * photo[3:], photo[3:]])
 
 
 def straight(photo: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
-    """Colours of premultiplied ones, whose alpha may be beyond [0, 1]; black where nothing is opaque."""
+    """Divide premultiplied colours by alpha, which may be beyond [0, 1]; black where nothing is opaque."""
     colours, alpha = photo[:3], photo[3:]
     return photo if len(photo) < 4 else torch.cat([torch.where(alpha > 0, colours / alpha, 0.0), alpha])
 
 
 def _distorted_pixels(intrinsics: Any, pinhole: Any, size: tuple[int, int]) -> Iterator[Float[Tensor, "h w 2"]]:
-    """For each pixel of the result, band by band, where `intrinsics` sees the same, in its pixels."""
+    """Yield, band by band, where `intrinsics` sees what each pixel of the result shows, in its pixels."""
     width, height = size
     columns = (torch.arange(width, dtype=torch.float64) + 0.5) * (pinhole.width / width)
     rows = (torch.arange(height, dtype=torch.float64) + 0.5) * (pinhole.height / height)
@@ -211,20 +198,14 @@ def sample(photo: Float[Tensor, "C H W"], pixels: Float[Tensor, "h w 2"]) -> Flo
 
 
 def _keys(t: Float[Tensor, "*shape"]) -> Float[Tensor, "4 *shape"]:
-    """Weights of the samples at -1, 0, 1, 2 for a position t in [0, 1) (Keys 1981)."""
-    return torch.stack(
-        [
-            ((2 - t) * t - 1) * t / 2,
-            ((3 * t - 5) * t * t + 2) / 2,
-            ((4 - 3 * t) * t + 1) * t / 2,
-            (t - 1) * t * t / 2,
-        ]
-    )
+    """Return weights of the samples at -1, 0, 1, 2 for a position t in [0, 1) (Keys 1981)."""
+    near = ((3 * t - 5) * t * t + 2) / 2, ((4 - 3 * t) * t + 1) * t / 2
+    return torch.stack([((2 - t) * t - 1) * t / 2, *near, (t - 1) * t * t / 2])
 
 
 @dataclass(frozen=True, eq=False)
 class StoredUndistortion:
-    """`undistort` for one photo, its result kept as PNG between runs."""
+    """Undistortion of one photo, its result kept as PNG between runs."""
 
     photo: Path
     intrinsics: Any
@@ -245,12 +226,13 @@ class StoredUndistortion:
         return result
 
     def stored(self) -> Path:
-        """Where the result is kept; another photo, camera or method has another place."""
-        key = content_key(METHOD, "premultiplied", _numbers(self.intrinsics), _numbers(self.pinhole), self.size)
+        """Return the place of the result; another photo, camera or method has another one."""
+        lenses = ((*_numbers(lens)[:3], lens.params.tolist()) for lens in (self.intrinsics, self.pinhole))
+        key = content_key(METHOD, "premultiplied", *lenses, self.size)
         turned = [self.turned] if self.turned != 1 else []
         name = content_key(str(self.photo.resolve().parent), *file_stamp(self.photo), *turned)
         return cache_folder("undistorted", key) / f"{self.photo.stem}_{name}.png"
 
 
-def _numbers(camera: Any) -> tuple[str, int, int, list[float]]:
-    return camera.model_name, camera.width, camera.height, camera.params.tolist()
+def _numbers(camera: Any) -> tuple[str, int, int, tuple[float, ...]]:
+    return camera.model_name, camera.width, camera.height, tuple(camera.params.tolist())

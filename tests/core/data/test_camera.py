@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsx.core.data.camera import Camera, Frame, centred, look_at
+from gsx.core.data.camera import Camera, Frame, look_at
 from gsx.core.errors import InputError
 
 
@@ -142,9 +142,3 @@ def test_right_of_the_target_is_right_in_the_picture() -> None:
 def test_look_at_refuses_degenerate_directions(eye: tuple, target: tuple) -> None:
     with pytest.raises(ValueError, match="general position"):
         look_at(eye, target, fov_x=1, width=8, height=8)
-
-
-def test_centred_moves_only_the_principal_point() -> None:
-    moved = centred(camera())
-    assert (moved.cx, moved.cy) == (60, 45)
-    assert (moved.fx, moved.fy, moved.size) == (130, 110, (120, 90))

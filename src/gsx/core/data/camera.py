@@ -34,8 +34,13 @@ class Frame:
     height: int
 
     def shares(self, across: float, down: float) -> tuple[float, float]:
-        """A movement in px, as shares of the sides."""
+        """Return a movement in px as shares of the sides."""
         return across / self.width, down / self.height
+
+    def scaled(self, sx: float, sy: float) -> "Frame":
+        """Return the frame on a raster with so many times as many columns and rows."""
+        left, top, width, height = self.left * sx, self.top * sy, self.width * sx, self.height * sy
+        return Frame(left=round(left), top=round(top), width=round(width), height=round(height))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -55,7 +60,7 @@ class Camera:
     near: float = NEAR
     """Splats at this camera depth or nearer are not drawn, in scene units."""
     cut_from: Frame | None = None
-    """The frame this raster was cropped from; None: it is its own."""
+    """The frame this raster was cropped from; None: it is not cropped."""
 
     @property
     def frame(self) -> Frame:
@@ -68,7 +73,7 @@ class Camera:
         return -self.rotation.T @ self.translation
 
     def to_camera(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-        """World points in the camera's frame, float64: far from the origin float32 is too coarse."""
+        """Return world points in the camera's frame, float64: far from the origin float32 is too coarse."""
         points, double = points.double(), torch.float64
         rotation, translation = (uploaded(x, points.device, double) for x in (self.rotation.T, self.translation))
         return points @ rotation + translation
@@ -84,85 +89,63 @@ class Camera:
         return max(self.fx, self.fy)
 
     def with_pose_of(self, other: "Camera") -> "Camera":
-        """This camera where the other one stands, looking where that looks."""
+        """Return this camera with the pose of another."""
         return replace(self, rotation=other.rotation, translation=other.translation)
 
     def has_pose_of(self, other: "Camera") -> bool:
-        """Whether both have one pose, bit for bit."""
+        """Return whether both have one pose, bit for bit."""
         return torch.equal(self.rotation, other.rotation) and torch.equal(self.translation, other.translation)
 
     def draws_as(self, other: "Camera") -> bool:
-        """Whether both draw the same picture, bit for bit."""
+        """Return whether both draw the same picture, bit for bit."""
         numbers = ("fx", "fy", "cx", "cy", "width", "height", "near", "frame")
         alike = all(getattr(self, name) == getattr(other, name) for name in numbers)
         return alike and self.has_pose_of(other)
 
     def resize(self, width: int, height: int) -> "Camera":
-        """The same field of view on another raster; intrinsics scale per axis."""
-        sx, sy, frame = width / self.width, height / self.height, self.cut_from
-        return replace(
-            self,
-            fx=self.fx * sx,
-            fy=self.fy * sy,
-            cx=self.cx * sx,
-            cy=self.cy * sy,
-            width=width,
-            height=height,
-            cut_from=frame
-            and Frame(
-                left=round(frame.left * sx),
-                top=round(frame.top * sy),
-                width=round(frame.width * sx),
-                height=round(frame.height * sy),
-            ),
-        )
+        """Return the same field of view on another raster; intrinsics scale per axis."""
+        sx, sy = width / self.width, height / self.height
+        lens = {"fx": self.fx * sx, "fy": self.fy * sy, "cx": self.cx * sx, "cy": self.cy * sy}
+        frame = self.cut_from and self.cut_from.scaled(sx, sy)
+        return replace(self, **lens, width=width, height=height, cut_from=frame)
 
     def zoom(self, factor: float) -> "Camera":
-        """`factor` times the focal length and the raster: the same view sampled more finely."""
+        """Return the same view sampled more finely: `factor` times the focal length and the raster."""
         return self.resize(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
     def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
-        """The window with its upper left corner at pixel (left, top); it may reach past the raster, where nothing is
-        drawn by `cull=published`, as by 3D-GS, and all by `cull=tight`.
+        """Return the camera of a window with its upper left corner at pixel (left, top); InputError: it has no pixels.
 
-        Raises:
-            InputError: it has no pixels.
+        Past the raster, `cull=published` draws nothing, as 3D-GS, and `cull=tight` all.
         """
         if width < 1 or height < 1:
             raise InputError(f"a window of {width} x {height} px has no pixels: give a width and a height of 1 or more")
-        frame = self.frame
-        return replace(
-            self,
-            cx=self.cx - left,
-            cy=self.cy - top,
-            width=width,
-            height=height,
-            cut_from=replace(frame, left=frame.left + left, top=frame.top + top),
-        )
+        frame = replace(self.frame, left=self.frame.left + left, top=self.frame.top + top)
+        return replace(self, cx=self.cx - left, cy=self.cy - top, width=width, height=height, cut_from=frame)
 
     def sees(self, points: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
-        """Which world points lie in front of it and within its raster, hidden or not."""
+        """Return which world points lie in front of it and within its raster, hidden or not."""
         pixels, depth = self.project(points)
         return ((pixels >= 0) & (pixels <= pixels.new_tensor(self.size))).all(dim=1) & (depth > 0)
 
     def shows(self, pixels: Float[Tensor, "P 2"], depths: Float[Tensor, "P"]) -> Bool[Tensor, "P"]:
-        """Which projected points lie on a pixel of its raster, beyond its near plane."""
+        """Return which projected points lie on a pixel of its raster, beyond its near plane."""
         return ((pixels >= 0) & (pixels < pixels.new_tensor(self.size))).all(1) & (depths > self.near)
 
     def narrow(self, fraction: float) -> "Camera":
-        """The centre `fraction` of the raster at unchanged focal length."""
+        """Return the camera of the centre `fraction` of the raster, at unchanged focal length."""
         width, height = max(1, round(self.width * fraction)), max(1, round(self.height * fraction))
         return self.crop((self.width - width) // 2, (self.height - height) // 2, width, height)
 
     def project(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P"]]:
-        """Pixel positions and depths of world points; positions mean nothing where depth <= 0."""
+        """Return pixel positions and depths of world points; positions mean nothing where depth <= 0."""
         camera_points = self.to_camera(points)
         depth = camera_points[:, 2]
         focal, centre = depth.new_tensor([self.fx, self.fy]), depth.new_tensor([self.cx, self.cy])
         return (camera_points[:, :2] / depth[:, None] * focal + centre).to(points), depth.to(points)
 
     def unproject(self, pixels: Float[Tensor, "P 2"], depths: Float[Tensor, "P"]) -> Float[Tensor, "P 3"]:
-        """World points at pixel positions and depths."""
+        """Return world points at pixel positions and depths."""
         x = (pixels[:, 0] - self.cx) / self.fx * depths
         y = (pixels[:, 1] - self.cy) / self.fy * depths
         points = torch.stack([x, y, depths], 1).double()
@@ -170,7 +153,7 @@ class Camera:
 
 
 def offsets_from(points: Float[Tensor, "P 3"], centre: Float[Tensor, "3"]) -> Float[Tensor, "P 3"]:
-    """points - centre, subtracted in float64 and then rounded to the dtype of the points; differentiable in both.
+    """Return points - centre, subtracted in float64 and rounded to the dtype of the points; differentiable in both.
 
     Far from the origin the centre itself, rounded first, would move by a grain of the coordinates (docs/numerics.md).
     """
@@ -187,7 +170,7 @@ def look_at(
     height: int,
     near: float = NEAR,
 ) -> Camera:
-    """A camera at `eye` looking at `target`, `up` pointing up in the picture, horizontal field of view in radians.
+    """Return a camera at `eye` looking at `target`, `up` pointing up in the picture; field of view in radians.
 
     Raises:
         ValueError: `eye` equals `target`, or `up` is parallel to the viewing direction.
@@ -211,22 +194,13 @@ def pinhole(
     height: int,
     near: float = NEAR,
 ) -> Camera:
-    """A camera of square pixels with its principal point at the middle of the raster; focal length in px."""
-    return Camera(
-        rotation=rotation,
-        translation=translation,
-        fx=focal,
-        fy=focal,
-        cx=width / 2,
-        cy=height / 2,
-        width=width,
-        height=height,
-        near=near,
-    )
+    """Return a camera of square pixels with its principal point at the middle of the raster; focal length in px."""
+    pose = {"rotation": rotation, "translation": translation}
+    return Camera(**pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height, near=near)
 
 
 def upright(rotations: Float[Tensor, "K 3 3"]) -> Float[Tensor, "3"]:
-    """The scene's up direction: near the mean image-up, and across the images' horizontal axes where those differ.
+    """Return the up direction: near the mean image-up, and across the images' horizontal axes where those differ.
 
     Photographers hold cameras level but tilt them: the mean image-up alone leans away from what a half ring surrounds.
     """
@@ -236,8 +210,3 @@ def upright(rotations: Float[Tensor, "K 3 3"]) -> Float[Tensor, "3"]:
     if solved.norm() < 1e-6:  # cameras rolled every way
         return up[0]
     return solved / solved.norm()
-
-
-def centred(camera: Camera) -> Camera:
-    """The camera with its principal point at the middle of the raster, as 3D-GS assumes (3D-GS, dataset_readers.py)."""
-    return replace(camera, cx=camera.width / 2, cy=camera.height / 2)

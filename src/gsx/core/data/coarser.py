@@ -13,18 +13,18 @@ from gsx.core.shapes import Bool, UInt8
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarseSource:
-    """The picture of a view, reduced by the scene's own filter (implements `gsx.core.data.scene.ImageSource`)."""
+    """The picture of a view, reduced by the scene's filter (implements `gsx.core.data.scene.ImageSource`)."""
 
     view: View
     reduction: Reduction
     times: int
     kept: list[UInt8[Tensor, "3 h w"]] = field(default_factory=list)
-    """The picture, once it was asked for."""
+    """The picture, once made."""
     masks: list[Bool[Tensor, "h w"] | None] = field(default_factory=list)
-    """Which pixels count, once that was asked for."""
+    """Which pixels count, once computed."""
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 h w"]:
-        """The whole picture: that is all that training asks for."""
+        """Return the whole picture: training needs no other."""
         if not self.kept:
             width, height = (side * self.times for side in camera.size)
             fine = self.view.image()[:, :height, :width]
@@ -32,15 +32,15 @@ class CoarseSource:
         return self.kept[0]
 
     def max_zoom(self, camera: Camera) -> float:
-        """There is this picture alone."""
+        """Return 1: there is this picture alone."""
         return 1.0
 
     def of(self, view: View) -> "CoarseSource":
-        """The same picture of a view of which other pixels count."""
+        """Return the same picture of a view of which other pixels count."""
         return replace(self, view=view, masks=[])
 
     def counted(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
-        """Pixels that are made of nothing but pixels that count: the filter takes from those beside, too."""
+        """Return pixels that are made of nothing but pixels that count: the filter takes from neighbours, too."""
         if not self.masks:
             fine, (width, height), times = self.view.counted(), camera.size, self.times
             blocks = None if fine is None else fine[: height * times, : width * times]
@@ -54,8 +54,10 @@ LEAST = 32
 
 
 def coarser(view: View, reduction: Reduction, times: int) -> View:
-    """A view, so many times as coarse; what is left over at its right and lower borders does not show. It stays as it
-    is where too few pixels would be left."""
+    """Return a view `times` as coarse, or the view itself where fewer than `LEAST` pixels would be left.
+
+    What is left over at its right and lower borders does not show.
+    """
     if times == 1 or min(view.camera.size) < LEAST * times:
         return view
     across, down = (side // times for side in view.camera.size)

@@ -27,7 +27,7 @@ PNG_EFFORT = {"png:compressionLevel": 1, "png:filter": 0x80}
 
 
 def read_image(path: str | Path) -> UInt8[Tensor, "C H W"]:
-    """Decodes an image to 3 or, with alpha, 4 channels.
+    """Decode an image to 3 or, with alpha, 4 channels.
 
     Grey becomes RGB, 16 bits are rounded to 8, floating-point files are taken as scene-linear light and get the
     sRGB curve, premultiplied colours are divided by their alpha. The raster is as stored, which is what COLMAP,
@@ -37,40 +37,21 @@ def read_image(path: str | Path) -> UInt8[Tensor, "C H W"]:
         InputError: the file is missing, damaged, CMYK, or has channels that are not grey or RGB with or without alpha.
     """
     pixels, spec = _decode(Path(path))
-    told = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 1 or Path(path).suffix.lower() == ".bmp"
-    straight = spec.alpha_channel < 0 or told  # OpenImageIO does not say so of BMP
+    stated = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 1 or Path(path).suffix.lower() == ".bmp"
+    straight = spec.alpha_channel < 0 or stated  # OpenImageIO does not state it for BMP
     image = _display_bytes(_rgb_or_rgba(pixels), straight, path)
     return image.permute(2, 0, 1).contiguous()
 
 
 def image_size(path: str | Path) -> Size:
-    """(width, height) as `read_image` gives it, from the header alone.
-
-    Raises:
-        InputError: the file is missing or is no image.
-    """
+    """Return (width, height) as `read_image` gives it, from the header alone; InputError as `header_of`."""
     spec = header_of(path)
     return spec.width, spec.height
 
 
 def has_alpha(path: str | Path) -> bool:
-    """Whether an image has an alpha channel, from the header alone.
-
-    Raises:
-        InputError: the file is missing or is no image.
-    """
+    """Return whether an image has an alpha channel, from the header alone; InputError as `header_of`."""
     return bool(header_of(path).alpha_channel >= 0)
-
-
-def checked_size(path: str | Path, expected: Size) -> Size:
-    """`image_size`, provided that the image is what the camera model was made for, or a uniform reduction of it.
-
-    Raises:
-        InputError: the size differs by more than the rounding to whole pixels.
-    """
-    size = image_size(path)
-    refuse_other_size(path, size, expected)
-    return size
 
 
 def write_image(
@@ -78,11 +59,9 @@ def write_image(
     image: UInt8[Tensor, "C H W"] | Float[Tensor, "C H W"],
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
-    """Writes RGB as PNG or JPEG, by suffix, or straight RGBA as PNG; floats are rounded by `to_uint8`.
+    """Write RGB as PNG or JPEG, by suffix, or straight RGBA as PNG; the file appears whole or not at all.
 
-    `attributes`: more of the file's header, by OpenImageIO's names, EXIF for example.
-
-    The file appears whole or not at all.
+    image: floats are rounded by `to_uint8`; attributes: more of the header by OpenImageIO's names, EXIF for example.
 
     Raises:
         InputError: the suffix does not suit, or the file cannot be written.
@@ -113,7 +92,7 @@ def write_image(
 
 @contextmanager
 def in_memory(place: Path) -> Iterator[str]:
-    """Name of a file in memory, for libraries that write files by name; when the block ends its content is at `place`.
+    """Yield the name of a file in memory, for libraries that write by name; at the end its content goes to `place`.
 
     OpenImageIO takes no notice of a disk that fails under a PNG or GIF, and under a JPEG it ends the process. Only
     Linux has such files; elsewhere the name is that of `place`.
@@ -136,7 +115,7 @@ class ImageCache:
         self._images: OrderedDict[Hashable, Tensor] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], Shaped[Tensor, "C H W"]]) -> Shaped[Tensor, "C H W"]:
-        """The image stored under `key`, or else what `make` returns, which is then stored."""
+        """Return the image stored under `key`, or else what `make` returns, which is then stored."""
         if key in self._images:
             self._images.move_to_end(key)
             return self._images[key]
@@ -150,7 +129,7 @@ class ImageCache:
 
 
 def composite(image: UInt8[Tensor, "4 H W"], background: tuple[float, float, float]) -> UInt8[Tensor, "3 H W"]:
-    """Straight-alpha RGBA over a background, in double precision, then truncated to 8 bits (3D-GS)."""
+    """Composite straight-alpha RGBA over a background, in double precision, truncated to 8 bits (3D-GS)."""
     values = image.double() / 255
     colour, alpha = values[:3], values[3:]
     behind = torch.tensor(background, dtype=torch.float64)[:, None, None]
@@ -186,7 +165,7 @@ def open_image(path: Path) -> Any:
 
 
 def _decode(path: Path) -> tuple[np.ndarray, Any]:
-    """Pixels [H, W, C] in the file's own number type, and OpenImageIO's description of the file."""
+    """Return pixels [H, W, C] in the file's own number type, and OpenImageIO's description of the file."""
     reader = open_image(path)
     spec = reader.spec()
     refuse_unusable(path, spec)
@@ -222,7 +201,7 @@ def refuse_unusable(path: str | Path, spec: Any) -> None:
 
 
 def in_one_line(text: str) -> str:
-    """What a library says in several."""
+    """Join the lines of a library's message."""
     return "; ".join(line.strip() for line in text.splitlines())
 
 
@@ -232,13 +211,13 @@ def _is_cmyk(spec: Any) -> bool:
 
 
 def _rgb_or_rgba(pixels: np.ndarray) -> np.ndarray:
-    """Grey, with or without alpha, repeated to three channels."""
+    """Repeat grey, with or without alpha, to three channels."""
     channels = pixels.shape[2]
     return pixels[..., (0, 0, 0, 1)[: channels + 2]] if channels < 3 else pixels
 
 
 def _display_bytes(pixels: np.ndarray, straight: bool, path: str | Path) -> UInt8[Tensor, "H W C"]:
-    """Straight 8-bit display values of pixels of any number type."""
+    """Return straight 8-bit display values of pixels of any number type."""
     if pixels.dtype == np.uint8 and straight:
         return torch.from_numpy(pixels)
     is_light = np.issubdtype(pixels.dtype, np.floating)

@@ -1,7 +1,6 @@
-"""Which pixels of a photograph count: masks, black where it shows what is not part of the scene.
+"""Masks of photographs, black where these show what is not part of the scene, as COLMAP and nerfstudio have them.
 
-So COLMAP (`masks/NAME.png`) and nerfstudio (`mask_path`) have them. A pixel of a reduced picture counts where nothing
-it was made from is masked.
+A pixel of a reduced picture counts where nothing it was made from is masked.
 """
 
 from collections.abc import Callable
@@ -37,47 +36,41 @@ class Mask:
     """Pixels that `remap` takes from on each side; 0 where it only turns pictures."""
 
     def masked(self) -> Bool[Tensor, "1 H W"]:
-        """Which pixels do not count, on the mask's own raster, undistorted; with all that interpolation took from them.
-
-        Raises:
-            InputError: the file cannot be read.
-        """
+        """Return which pixels of the undistorted mask do not count, with all that interpolation took from them."""
         picture = read_image(self.path)
         if self.alpha:
             picture = picture if self.remap is None else self.remap(picture)
             out = picture[3:] < OPAQUE if len(picture) == 4 else torch.zeros_like(picture[:1], dtype=torch.bool)
-            return out if self.remap is None else grown(out, self.reach)
-        out = picture[:1] < WHITE
-        if self.remap is None:
-            return out
-        return grown(self.remap((out * 255).to(torch.uint8).repeat(3, 1, 1))[:1] > 0, self.reach)
+        else:
+            out = picture[:1] < WHITE
+            out = out if self.remap is None else self.remap((out * 255).to(torch.uint8).repeat(3, 1, 1))[:1] > 0
+        return out if self.remap is None else grown(out, self.reach)
 
     def reduced(self, width: int, height: int, filter: str, whole: tuple[int, int]) -> Bool[Tensor, "1 height width"]:
-        """Which pixels count of a photograph of the size `whole` resized by a filter (`resize.FILTERS`)."""
+        """Return which pixels count of a photograph of the size `whole`, resized by a filter (`resize.FILTERS`)."""
         return untouched(self.masked(), width, height, filter, whole)
 
 
 def untouched(
     marked: Bool[Tensor, "1 H W"], width: int, height: int, filter: str, whole: tuple[int, int]
 ) -> Bool[Tensor, "1 height width"]:
-    """Which pixels of a picture of the size `whole`, resized by a filter (`resize.FILTERS`), are made from none that is
-    marked."""
+    """Return which pixels of a picture of the size `whole`, resized by a filter, are made from no marked one."""
     touched = adaptive_max_pool2d(marked.float()[None], (height, width))[0] > 0
     return ~grown(touched, REACH.get(filter, 0) if (width, height) != whole else 0)
 
 
 def grown(masked: Bool[Tensor, "1 H W"], reach: int) -> Bool[Tensor, "1 H W"]:
-    """With all pixels within `reach` of a masked one."""
+    """Grow a mask by all pixels within `reach` of it."""
     return max_pool2d(masked.float()[None], 2 * reach + 1, 1, reach)[0] > 0
 
 
 def where_counted(
     image: Float[Tensor, "C H W"], other: Float[Tensor, "C H W"], counted: Bool[Tensor, "H W"] | None
 ) -> Float[Tensor, "C H W"]:
-    """The image where pixels count, the other elsewhere; the image itself where there is no mask."""
+    """Return the image where pixels count, the other elsewhere; the image itself where there is no mask."""
     return image if counted is None else torch.where(counted.to(image.device), image, other)
 
 
 def blacked(image: Float[Tensor, "C H W"], counted: Bool[Tensor, "H W"] | None) -> Float[Tensor, "C H W"]:
-    """The image, black where pixels do not count: pictures are compared so, whatever is there."""
+    """Blacken an image where pixels do not count, so that pictures can be compared whatever is there."""
     return image if counted is None else torch.where(counted.to(image.device), image, 0)

@@ -34,7 +34,7 @@ class PhotoSource:
     """What of the photograph counts; None: all of it."""
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
-        """The photograph on the raster of `camera`, which is `whole` on any raster, or a crop of that.
+        """Return the photograph on the raster of `camera`, which is `whole` on any raster, or a crop of that.
 
         Raises:
             InputError: the file cannot be read or has another size than the camera model states.
@@ -46,11 +46,7 @@ class PhotoSource:
         return window.cut(image)
 
     def counted(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
-        """Which pixels of `image(camera)` count; None: all.
-
-        Raises:
-            InputError: the mask cannot be read, or leaves nothing of the photograph.
-        """
+        """Return which pixels of `image(camera)` count; None: all. InputError: the mask leaves none, or is damaged."""
         if self.mask is None:
             return None
         window, width, height = self.window_of(camera)
@@ -58,11 +54,9 @@ class PhotoSource:
         return window.cut(self.cache.get(made_by, lambda: self._counted(mask, width, height)))[0]
 
     def transparent(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
-        """Which pixels of `image(camera)` show nothing of the scene, all they were made from being transparent; None:
-        the photograph is opaque, or a mask says that what it leaves out is unknown. Decodes the file anew.
+        """Return which pixels of `image(camera)` show nothing of the scene, made from transparent ones alone.
 
-        Raises:
-            InputError: the file cannot be read or has another size than the camera model states.
+        None: the photograph is opaque, or a mask says that what it leaves out is unknown. Decodes the file anew.
         """
         if self.mask is not None or not has_alpha(self.path):
             return None
@@ -70,11 +64,7 @@ class PhotoSource:
         return window.cut(untouched(self._decoded()[3:] > 0, width, height, self.rule.filter, self.whole.size))[0]
 
     def window_of(self, camera: Camera) -> tuple[Window, int, int]:
-        """(what the camera sees of the whole photograph on its raster, width and height of that).
-
-        Raises:
-            ValueError: it reaches past the photograph.
-        """
+        """Return (the camera's window of the photograph, width and height of that); ValueError: it reaches past."""
         across, down = camera.fx / self.whole.fx, camera.fy / self.whole.fy
         width, height = round(self.whole.width * across), round(self.whole.height * down)
         left = round(self.whole.cx * across - camera.cx)
@@ -84,7 +74,7 @@ class PhotoSource:
         return Window(left=left, top=top, width=camera.width, height=camera.height), width, height
 
     def max_zoom(self, camera: Camera) -> float:
-        """How many times finer the photograph is than `camera`, with 1% for rounded sizes."""
+        """Return how many times finer the photograph is than `camera`, with 1% for rounded sizes."""
         return ZOOM_SLACK * self.whole.fx / camera.fx
 
     def _counted(self, mask: Mask, width: int, height: int) -> Bool[Tensor, "1 height width"]:

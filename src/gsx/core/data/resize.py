@@ -16,28 +16,20 @@ LIGHTS = ("display", "linear")
 
 
 def linear_from_display(display: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Light of display values (IEC 61966-2-1, sRGB), below 0 by the straight part of the curve."""
+    """Return the light of display values (IEC 61966-2-1, sRGB), below 0 by the straight part of the curve."""
     bright = display.clamp_min(0.04045)  # a power of what is negative is nan, and so is its gradient
     return torch.where(display <= 0.04045, display / 12.92, ((bright + 0.055) / 1.055) ** 2.4)
 
 
 def display_from_linear(light: Float[Tensor, "*shape"], limited: bool = True) -> Float[Tensor, "*shape"]:
-    """Display values of light, clamped to [0, 1] unless not `limited` (IEC 61966-2-1, sRGB)."""
+    """Return display values of light, clamped to [0, 1] unless not `limited` (IEC 61966-2-1, sRGB)."""
     light = light.clamp(0, 1) if limited else light
     bright = light.clamp_min(0.0031308)  # a power's slope at 0 is infinite
     return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * bright ** (1 / 2.4) - 0.055)
 
 
 def training_size(width: int, height: int, downscale: int, max_width: int) -> Size:
-    """Size to train at (3D-GS): divided by `downscale` and rounded; else limited to `max_width` (0: no limit).
-
-    Raises:
-        ConfigError: downscale is below 1 or max_width below 0.
-    """
-    if downscale < 1 or max_width < 0:
-        raise ConfigError(
-            f"scene.downscale is {downscale} and scene.max_width {max_width}, they must be at least 1 and 0."
-        )
+    """Return the size to train at (3D-GS): divided by `downscale` and rounded; else at most `max_width` (0: any)."""
     if downscale > 1:
         return max(1, round(width / downscale)), max(1, round(height / downscale))
     if max_width and width > max_width:
@@ -49,16 +41,11 @@ def training_size(width: int, height: int, downscale: int, max_width: int) -> Si
 def resize(
     image: UInt8[Tensor, "C H W"], width: int, height: int, filter: str = "bicubic", light: str = "display"
 ) -> UInt8[Tensor, "C height width"]:
-    """The image on another raster, each channel on its own: composite alpha first.
+    """Resize an image, each channel on its own: composite alpha first.
 
-    All filters widen with the reduction, so nothing aliases: Keys' cubic with a = -0.5, which on display values is
-    the published filter; the coverage of pixels by pixels (area); Lanczos with 3 lobes.
-
-    Raises:
-        ConfigError: an unknown filter or light.
+    All filters (`FILTERS`) widen with the reduction, so nothing aliases: Keys' cubic with a = -0.5, which on display
+    values is the published filter; the coverage of pixels by pixels (area); Lanczos with 3 lobes.
     """
-    _refuse_unknown("scene.resize_filter", filter, FILTERS)
-    _refuse_unknown("scene.resize_light", light, LIGHTS)
     if image.shape[1:] == (height, width):
         return image
     across, down = _weights(image.shape[2], width, filter), _weights(image.shape[1], height, filter)
@@ -81,15 +68,13 @@ class ResizeRule:
     """Display RGB in [0, 1] behind images with alpha."""
 
     def __post_init__(self) -> None:
-        _refuse_unknown("scene.resize_filter", self.filter, FILTERS)
-        _refuse_unknown("scene.resize_light", self.light, LIGHTS)
+        for key, value, known in (("filter", self.filter, FILTERS), ("light", self.light, LIGHTS)):
+            if value not in known:
+                raise ConfigError(
+                    f"scene.resize_{key} is '{value}', use one of {', '.join(known)}.{nearest(value, known)}"
+                )
         if len(self.background) != 3 or not all(0 <= value <= 1 for value in self.background):
             raise ConfigError(f"scene.background is {list(self.background)}, give red, green and blue in [0, 1].")
-
-
-def _refuse_unknown(key: str, value: str, options: tuple[str, ...]) -> None:
-    if value not in options:
-        raise ConfigError(f"{key} is '{value}', use one of {', '.join(options)}.{nearest(value, options)}")
 
 
 def _across(values: Float[Tensor, "C H W"], weights: Float[Tensor, "new W"]) -> Float[Tensor, "C H new"]:
@@ -101,12 +86,12 @@ def _down(values: Float[Tensor, "C H W"], weights: Float[Tensor, "new H"]) -> Fl
 
 
 def _rounded(levels: Float[Tensor, "C H W"]) -> UInt8[Tensor, "C H W"]:
-    """Values already in 0..255 to 8 bits; ties, which are exact on this scale, go up."""
+    """Round values in 0..255 to 8 bits; ties, which are exact on this scale, go up."""
     return (levels + 0.5).clamp(0, 255).to(torch.uint8)
 
 
 def _weights(size: int, new_size: int, filter: str) -> Float[Tensor, "new_size size"]:
-    """The filter as a sparse matrix whose rows add up to 1: what each new pixel takes from the old ones."""
+    """Return the filter as a sparse matrix whose rows add up to 1: what each new pixel takes from the old ones."""
     ratio = size / new_size
     stretch = max(ratio, 1.0)
     reach = (1 + ratio) / 2 if filter == "area" else REACH[filter] * stretch
@@ -125,14 +110,14 @@ def _weights(size: int, new_size: int, filter: str) -> Float[Tensor, "new_size s
 
 
 def _keys(x: Tensor) -> Tensor:
-    """Keys (1981) with a = -0.5, for |x| <= 2."""
+    """Evaluate Keys' cubic (1981) with a = -0.5, for |x| <= 2."""
     x = x.abs()
     inner = (1.5 * x - 2.5) * x * x + 1
     return torch.where(x < 1, inner, ((-0.5 * x + 2.5) * x - 4) * x + 2)
 
 
 def _lanczos(x: Tensor) -> Tensor:
-    """sinc windowed by its own central lobe, three times as wide, for |x| <= 3."""
+    """Evaluate sinc, windowed by its own central lobe, three times as wide, for |x| <= 3."""
     return torch.sinc(x) * torch.sinc(x / 3)
 
 
@@ -141,5 +126,5 @@ REACH = {"bicubic": 2, "lanczos": 3}
 
 
 def to_uint8(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
-    """Display values in [0, 1] rounded to 8 bits: x 255 + 0.5, clamped (3D-GS, metrics.py)."""
+    """Round display values in [0, 1] to 8 bits: x 255 + 0.5, clamped (3D-GS, metrics.py)."""
     return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)

@@ -19,7 +19,7 @@ class Window:
     height: int
 
     def cut(self, image: Shaped[Tensor, "C H W"]) -> Shaped[Tensor, "C h w"]:
-        """The part of an image inside the window."""
+        """Return the part of an image inside the window."""
         return image[:, *self.pixels]
 
     @property
@@ -28,11 +28,11 @@ class Window:
         return slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
 
     def of(self, camera: Camera) -> Camera:
-        """The camera through this window."""
+        """Return the camera through this window."""
         return camera.crop(self.left, self.top, self.width, self.height)
 
     def seen_by(self, other: Camera, camera: Camera) -> "Window":
-        """The pixels of another raster that show a part of this one of `camera`'s, from the same place; maybe none."""
+        """Return the pixels of another raster that show a part of this window of `camera`; maybe none."""
         left, right = (
             (edge - camera.cx) / camera.fx * other.fx + other.cx for edge in (self.left, self.left + self.width)
         )
@@ -43,18 +43,18 @@ class Window:
         return Window(columns.start, rows.start, len(columns), len(rows))
 
     def shares(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """Left, top, right and bottom edge, as shares of a raster of that size."""
+        """Return left, top, right and bottom edge, as shares of a raster of that size."""
         right, bottom = self.left + self.width, self.top + self.height
         return self.left / width, self.top / height, right / width, bottom / height
 
     def grown(self, margin: int, width: int, height: int) -> "Window":
-        """With up to `margin` more on each side, as far as a raster of that size reaches."""
+        """Return the window with up to `margin` more on each side, as far as a raster of that size reaches."""
         left, top = max(0, self.left - margin), max(0, self.top - margin)
         right, bottom = min(width, self.left + self.width + margin), min(height, self.top + self.height + margin)
         return Window(left, top, right - left, bottom - top)
 
     def halves(self, unit: int) -> tuple["Window", "Window"]:
-        """Two windows, cut across the longer side at the multiple of `unit` px nearest its middle, inside it."""
+        """Return two windows, cut across the longer side at the multiple of `unit` px nearest its middle."""
         cut = max(1, round(max(self.width, self.height) / 2 / unit)) * unit
         if self.width >= self.height:
             beyond = Window(self.left + cut, self.top, self.width - cut, self.height)
@@ -68,6 +68,6 @@ ROUNDING = 1e-6
 
 
 def covered(begin: float, end: float, size: int) -> range:
-    """Those of so many pixels in a row that lie between two places, in part or whole."""
+    """Return those of `size` pixels in a row that lie between two places, in part or whole."""
     first, last = math.floor(begin + ROUNDING), math.ceil(end - ROUNDING)
     return range(min(max(first, 0), size), min(max(last, 0), size))

@@ -1,0 +1,167 @@
+"""Files of poses as JSON: their frames, matrices and numbers, and which of their photos are on disk."""
+
+import math
+from collections import Counter
+from collections.abc import Container, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.errors import InputError
+from gsx.core.files import read_json as parsed
+from gsx.core.files import refuse_lfs_pointer
+from gsx.core.shapes import Float
+from gsx.scenes.duplicates import refuse_file_twice
+from gsx.scenes.photo_names import find_photo, likely_photo, plain_name
+
+NAMED_AT_MOST = 5  # file names spelt out in a note
+ROTATION_TOLERANCE = 0.01  # of the axes' lengths: text formats round, but a scaled camera is another camera
+LAST_ROW = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the object that a JSON file holds.
+
+    Raises:
+        InputError: the file is missing or is no JSON object.
+    """
+    if not path.is_file():
+        raise InputError(f"'{path}' does not exist: scene.path must be the folder that holds it.")
+    refuse_lfs_pointer(path)
+    try:
+        content = parsed(path)
+    except (OSError, ValueError) as problem:
+        raise InputError(f"'{path}' is no valid JSON ({problem}), copy or export it anew.") from None
+    if not isinstance(content, dict):
+        raise InputError(f"'{path}' holds no JSON object, copy or export it anew.")
+    return content
+
+
+def read_frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the content of a transforms file and its frames, each with a file name; InputError as `frames_in`."""
+    content = read_json(path)
+    return content, frames_in(content, path)
+
+
+def frames_in(content: Mapping[str, Any], path: Path, key: str = "frames") -> list[dict[str, Any]]:
+    """Return the frames that a transforms file lists under a key, each with a file name.
+
+    Raises:
+        InputError: there are none, or one has no name, one that is no text, or that of another.
+    """
+    frames = content.get(key)
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"'{path}' lists no {key}, export it anew.")
+    if not all(isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames):
+        if any(isinstance(frame, dict) and "rgb_path" in frame for frame in frames):
+            raise InputError(f"'{path}' is of SDFStudio (rgb_path), which gsx does not read: export transforms.json.")
+        raise InputError(f"'{path}' has a frame without 'file_path', export it anew.")
+    names = [frame["file_path"] for frame in frames]
+    for name in (*names, *(frame["mask_path"] for frame in frames if isinstance(frame.get("mask_path"), str))):
+        if any(letter == "\0" or "\ud800" <= letter <= "\udfff" for letter in name):  # NUL, or half of a character
+            raise InputError(f"'{path}' names a photo {name!a}, which is no text: rename the photo, and it here.")
+    refuse_twice(names, path)
+    return frames
+
+
+def refuse_twice(names: Sequence[str], path: Path) -> None:
+    """Raise InputError if two names of a poses file are one."""
+    for name, count in Counter(map(plain_name, names)).items():
+        if count > 1:
+            raise InputError(f"'{path}' has '{name}' twice, perhaps to train on and to test on: remove one.")
+
+
+def finite_number(value: Any) -> float | None:
+    """Return a number of a file; None for what is no number, not finite, or beyond double precision."""
+    try:
+        number = float(value) if isinstance(value, float | int) else math.nan
+    except OverflowError:  # an integer of hundreds of digits
+        return None
+    return number if math.isfinite(number) else None
+
+
+def refuse_partial(
+    missing: Sequence[str],
+    count: int,
+    place: Path,
+    allowed: float,
+    fault: str = "are not on disk",
+    remedy: str = "complete them",
+) -> None:
+    """Raise InputError if more than the share `allowed` of the `count` images of `place` cannot be used."""
+    share = len(missing) / count
+    if share > allowed:
+        raise InputError(
+            f"{len(missing)} of the {count} images of '{place}' {fault} ({some_names(missing)}): {remedy}, or train on "
+            f"what is there with scene.missing={math.ceil(100 * share) / 100:g} or more."
+        )
+
+
+def present_frames(
+    folder: Path, frames: list[dict[str, Any]], file: Path, allowed: float
+) -> tuple[list[tuple[dict[str, Any], Path]], list[str]]:
+    """Return the frames whose photo is on disk with its path, and a note that names the others.
+
+    Raises:
+        InputError: no photo is there, more than the share `allowed` is not, or one is there under two names.
+    """
+    pairs = [(frame, find_photo(folder, frame["file_path"])) for frame in frames]
+    present = [(frame, photo) for frame, photo in pairs if photo is not None]
+    missing = [plain_name(frame["file_path"]) for frame, photo in pairs if photo is None]
+    remedy = renaming(folder, missing, {photo for _, photo in present}) if len(missing) > allowed * len(frames) else ""
+    if not present:
+        raise InputError(
+            f"None of the {len(frames)} images of '{file}' is in '{folder}' (looked for {some_names(missing)}): "
+            f"{remedy or 'put them there or correct the names in the file'}."
+        )
+    refuse_partial(missing, len(frames), file, allowed, remedy=remedy or "complete them")
+    refuse_file_twice([plain_name(frame["file_path"]) for frame, _ in present], [photo for _, photo in present], file)
+    note = f"Skipped {len(missing)} of the {len(frames)} images of {file.name}, not on disk: {some_names(missing)}."
+    return present, [note] if missing else []
+
+
+def renaming(folder: Path, missing: Sequence[str], taken: Container[Path]) -> str:
+    """Return what to do about missing photos if one lies there under another name, which no other frame has taken."""
+    pairs = ((name, likely_photo(folder, name)) for name in missing[:NAMED_AT_MOST])
+    right = (pair for pair in pairs if pair[1] and folder / pair[1] not in taken)
+    return next((f"'{there}' is there, correct '{name}' in the file" for name, there in right), "")
+
+
+def pose_from_opengl(matrix: Any, place: str) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
+    """Return rotation and translation camera_from_world, float64, of an OpenGL camera-to-world matrix (3D-GS).
+
+    `matrix` holds 3 or 4 rows of 4 numbers; OpenGL cameras have x right, y up, z back. Rotations that text has
+    rounded are replaced by the nearest exact ones.
+
+    Raises:
+        InputError: it is no such matrix, not finite, or no rigid motion; `place` says where it stands.
+    """
+    try:
+        world_from_camera = torch.tensor(matrix, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise InputError(f"{place} has a pose that is no matrix of numbers, export it anew.") from None
+    if world_from_camera.shape not in ((3, 4), (4, 4)) or not world_from_camera.isfinite().all():
+        raise InputError(f"{place} has a pose that is not 3 x 4 or 4 x 4 finite numbers, remove or repair it.")
+    if len(world_from_camera) == 4 and (world_from_camera[3] - LAST_ROW).abs().max() > ROTATION_TOLERANCE:
+        raise InputError(f"{place} has a pose whose fourth row is not 0 0 0 1: is the matrix transposed?")
+    u, stretch, vh = torch.linalg.svd(world_from_camera[:3, :3])
+    if (stretch - 1).abs().max() > ROTATION_TOLERANCE or torch.linalg.det(u @ vh) < 0:
+        raise InputError(f"{place} has a pose that scales or mirrors, export cameras without scale.")
+    rotation = (u @ vh @ torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))).T
+    return rotation, -rotation @ world_from_camera[:3, 3]
+
+
+def frames_line(file: Path) -> str:
+    """Return how many images of a transforms file are there, for `gsx scenes`."""
+    names = [frame["file_path"] for frame in read_frames(file)[1]]
+    absent = [name for name in names if find_photo(file.parent, name) is None]
+    missing = f", absent: {some_names(absent)}" if absent else ""
+    return f"images    {len(names) - len(absent)} of {len(names)} of {file.name}{missing}"
+
+
+def some_names(names: Sequence[str]) -> str:
+    """Return the first few names, and how many more there are."""
+    more = len(names) - NAMED_AT_MOST
+    return ", ".join(names[:NAMED_AT_MOST]) + (f" and {more} more" if more > 0 else "")
