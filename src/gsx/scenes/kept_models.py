@@ -12,24 +12,24 @@ from gsx.engine.cache import enlist, listed, make_folder, whole
 
 
 def kept_model(final: Path, make: Callable[[Path], Any]) -> Path:
-    """The folder of a model in the cache; where it is not there whole, it is made.
+    """Return the folder of a model in the cache; where it is not there whole, it is made.
 
-    make: what gives the pycolmap.Reconstruction, in an empty folder for its files. Raises what that raises.
+    make: returns the pycolmap.Reconstruction, and has an empty folder for its files.
     """
     if intact(final):
         return final
     make_folder(final.parent)
     with tempfile.TemporaryDirectory(".partial", f".{final.name}.{own_mark()}-", final.parent) as work:
-        found = make(Path(work))
+        made = make(Path(work))
         model = make_folder(Path(work) / "model")
-        found.write_binary(model)
+        made.write_binary(model)
         enlist(*model.iterdir())
         _publish(model, final)
     return final
 
 
 def intact(final: Path) -> bool:
-    """Whether there is a model in the cache, and all its files are as they were written."""
+    """Return whether there is a model in the cache, and all its files are as they were written."""
     names = listed(final)
     return bool(names) and all(whole(final / name) for name in names)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from gsx.core.errors import InputError
-from gsx.core.shapes import Bool, Float, Int
+from gsx.core.shapes import Bool, Float
 
 STEPS = 129
 """Places along each side of an undistorted picture at which its orientation is checked."""
@@ -113,16 +113,18 @@ def cut_where_folded(camera: Any, pinhole: Any) -> tuple[Any, Cut]:
     Raises:
         InputError: it would show less than `LEAST_SHARE` of the photo.
     """
-    lattice = photo_lattice(camera)
+    x = around_axis(camera.width, camera.principal_point_x, camera.focal_length_x)
+    y = around_axis(camera.height, camera.principal_point_y, camera.focal_length_y)
+    lattice = lattice_of(camera, x, y)
     usable = usable_rays(camera, lattice)
     place = nearest_to_axis(camera, lattice, usable)
     if place is None:
         raise refusal(camera, 0)
     top, bottom, left, right = largest_rectangle(usable, *place)
     part = lattice.areas[top : bottom + 1, left : right + 1]
-    window = (float(values) for values in (lattice.x[left], lattice.x[right], lattice.y[top], lattice.y[bottom]))
-    cut = with_window(pinhole, *window)
-    pixels = 0 if cut is None else round(float(part.mean()) * covered(lattice, top, bottom, left, right))
+    cut = with_window(pinhole, *(float(slope) for slope in (x[left], x[right], y[top], y[bottom])))
+    area = float((x[right] - x[left]) * (y[bottom] - y[top]))  # in slopes
+    pixels = 0 if cut is None else round(float(part.mean()) * area)
     if cut is None or pixels < LEAST_SHARE * camera.width * camera.height:
         raise refusal(camera, pixels)
     return cut, Cut(min(pixels, camera.width * camera.height), radius_without_rays(camera))
@@ -138,9 +140,11 @@ def usable_rays(camera: Any, lattice: Lattice) -> Bool[Tensor, "Y X"]:
 def surrounded(camera: Any, pixels: Float[Tensor, "*N 2"]) -> Bool[Tensor, "*N"]:
     """Return which positions on a photo are interpolated from pixels for which there is a ray."""
     x, y, lost = pixels_without_rays(camera)
-    reach = [math.ceil(REACH / spacing(places)) for places in (y, x)]
+    step_x, step_y = (float(places[1] - places[0]) if len(places) > 1 else 1.0 for places in (x, y))
+    reach = [math.ceil(REACH / step) for step in (step_y, step_x)]
     near = max_pool2d(lost.float()[None], [2 * n + 1 for n in reach], 1, reach)[0] > 0
-    column, row = (nearest_place(pixels[..., axis], places) for axis, places in enumerate((x, y)))
+    column = ((pixels[..., 0] - x[0]) / step_x).round().long().clamp(0, len(x) - 1)
+    row = ((pixels[..., 1] - y[0]) / step_y).round().long().clamp(0, len(y) - 1)
     return ~near[row, column]
 
 
@@ -151,16 +155,6 @@ def pixels_without_rays(camera: Any) -> tuple[Float[Tensor, "X"], Float[Tensor, 
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
     rays = torch.from_numpy(camera.cam_from_img(pixels.numpy()))
     return x, y, ~rays.isfinite().all(1).reshape(len(y), len(x))
-
-
-def spacing(places: Float[Tensor, "N"]) -> float:
-    """Return the distance between neighbours in equal steps; 1 for a single place."""
-    return float(places[1] - places[0]) if len(places) > 1 else 1.0
-
-
-def nearest_place(values: Float[Tensor, "*N"], places: Float[Tensor, "P"]) -> Int[Tensor, "*N"]:
-    """Return the index of the place nearest to each value, for places in equal steps."""
-    return ((values - places[0]) / spacing(places)).round().long().clamp(0, len(places) - 1)
 
 
 def nearest_to_axis(camera: Any, lattice: Lattice, usable: Bool[Tensor, "Y X"]) -> tuple[int, int] | None:
@@ -174,18 +168,6 @@ def nearest_to_axis(camera: Any, lattice: Lattice, usable: Bool[Tensor, "Y X"]) 
     return (row, column) if unfolded else None
 
 
-def covered(lattice: Lattice, top: int, bottom: int, left: int, right: int) -> float:
-    """Return the area of a rectangle of the lattice, in slopes."""
-    return float((lattice.x[right] - lattice.x[left]) * (lattice.y[bottom] - lattice.y[top]))
-
-
-def photo_lattice(camera: Any) -> Lattice:
-    """Return the lattice of the rays that a photo of a pycolmap camera may show, its principal axis among them."""
-    x = around_axis(camera.width, camera.principal_point_x, camera.focal_length_x)
-    y = around_axis(camera.height, camera.principal_point_y, camera.focal_length_y)
-    return lattice_of(camera, x, y)
-
-
 def around_axis(side: int, principal: float, focal: float) -> Float[Tensor, "N"]:
     """Return slopes across `LARGEST_SCALE` times a side, from the principal axis outwards in equal steps, with 0."""
     before, after = (min(max(reach, 0.0), LARGEST_SCALE * side) for reach in (principal, side - principal))
@@ -196,7 +178,8 @@ def around_axis(side: int, principal: float, focal: float) -> Float[Tensor, "N"]
 
 def largest_rectangle(usable: Bool[Tensor, "Y X"], row: int, column: int) -> tuple[int, int, int, int]:
     """Return (top, bottom, left, right), inclusive, of the usable rectangle of the largest area around one place."""
-    up, down = reaches(usable, row)  # of each column, how many places are usable without a gap
+    # of each column, how many places from the row upwards, and downwards, are usable without a gap
+    up, down = (part.long().cumprod(0).sum(0) for part in (usable[: row + 1].flip(0), usable[row:]))
     left_up, right_up = (outward(up, column, side) for side in (-1, 1))
     left_down, right_down = (outward(down, column, side) for side in (-1, 1))
     heights = torch.minimum(left_up[:, None], right_up) + torch.minimum(left_down[:, None], right_down) - 2
@@ -205,12 +188,6 @@ def largest_rectangle(usable: Bool[Tensor, "Y X"], row: int, column: int) -> tup
     before, after = divmod(int(areas.argmax()), areas.shape[1])
     above, below = min(left_up[before], right_up[after]), min(left_down[before], right_down[after])
     return row - max(int(above) - 1, 0), row + max(int(below) - 1, 0), column - before, column + after
-
-
-def reaches(usable: Bool[Tensor, "Y X"], row: int) -> tuple[Tensor, Tensor]:
-    """Return how many places of each column are usable from a row upwards, and downwards, with itself."""
-    up, down = usable[: row + 1].flip(0), usable[row:]
-    return up.long().cumprod(0).sum(0), down.long().cumprod(0).sum(0)
 
 
 def outward(reach: Tensor, column: int, side: int) -> Tensor:

@@ -32,7 +32,7 @@ PAIR_BLOCK = 10  # photos whose pairs COLMAP matches before writing them down, w
 
 @dataclass(frozen=True, kw_only=True)
 class SfmOptions:
-    """What decides about a reconstruction; values and sources in `conf/scene/photos.yaml`."""
+    """Options that decide about a reconstruction; values and sources in `conf/scene/photos.yaml`."""
 
     matcher: str
     """auto | exhaustive (every pair) | sequential (neighbours in order of name: video frames, walks)."""
@@ -57,12 +57,9 @@ class SfmOptions:
 
 
 def reconstruct(folder: Path, sizes: Sizes, options: SfmOptions, work: Path) -> Any:
-    """The largest pycolmap.Reconstruction of the photos in `folder`, None if there is none.
+    """Return the largest pycolmap.Reconstruction of the photos in `folder`, None if there is none.
 
-    `work` is an empty folder for intermediate files.
-
-    Raises:
-        InputError: one camera is asked for photos of several sizes.
+    `work` is an empty folder for intermediate files. InputError: one camera is to take photos of several sizes.
     """
     database, sparse = work / "database.db", work / "sparse"
     sparse.mkdir()
@@ -88,7 +85,7 @@ def import_photos(database: Path, folder: Path, sizes: Sizes, options: SfmOption
 
 
 def _camera_groups(folder: Path, sizes: Sizes, camera_mode: str) -> list[list[str]]:
-    """Names of photos that share a camera; of those of one size `auto` asks each for its lens."""
+    """Return names of photos that share a camera; `auto` compares the lenses of those of one size."""
     if camera_mode == "per_image":
         return [sorted(sizes)]
     if camera_mode == "auto":
@@ -101,7 +98,7 @@ def _camera_groups(folder: Path, sizes: Sizes, camera_mode: str) -> list[list[st
 
 
 def _alike(kinds: Mapping[str, Any]) -> list[list[str]]:
-    """Sorted names of each kind, in the order of the kinds."""
+    """Return sorted names of each kind, in the order of the kinds."""
     return [sorted(name for name in kinds if kinds[name] == kind) for kind in sorted(set(kinds.values()))]
 
 
@@ -130,14 +127,14 @@ def _extract(database: Path, folder: Path, sizes: Sizes, options: SfmOptions) ->
 
 
 def chosen_matcher(count: int, options: SfmOptions) -> str:
-    """`auto` resolved for a number of photos."""
+    """Return the matcher for a number of photos, for `auto` as well."""
     if options.matcher != "auto":
         return options.matcher
     return "exhaustive" if count <= options.exhaustive_limit else "sequential"
 
 
 def pair_count(count: int, options: SfmOptions) -> int:
-    """How many pairs of photos are matched."""
+    """Return how many pairs of photos are matched."""
     if chosen_matcher(count, options) == "exhaustive":
         return count * (count - 1) // 2
     return sum(max(0, count - 2**k) for k in range(options.overlap))
@@ -168,7 +165,7 @@ def _match(database: Path, count: int, options: SfmOptions) -> None:
 
 
 def pairing_options(matcher: str, overlap: int) -> Any:
-    """pycolmap's options for which pairs to match."""
+    """Return pycolmap's options for which pairs to match."""
     import pycolmap
 
     if matcher == "exhaustive":
@@ -223,7 +220,7 @@ def watched(stage: str, work: Callable[[Any], T], done: Callable[[], int], total
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep COLMAP's own log off the terminal: progress is told here, errors are raised, lost photos are named."""
+    """Keep COLMAP's own log off the terminal: progress is logged here, errors are raised, lost photos are named."""
     import pycolmap
 
     level = pycolmap.logging.minloglevel

@@ -21,7 +21,7 @@ from gsx.core.errors import InputError
 from gsx.core.shapes import Float, UInt8
 from gsx.engine.cache import cache_folder, content_key, file_stamp, make_folder
 from gsx.engine.kept_images import keep_image, kept_image
-from gsx.scenes.lens_folds import Cut, cut_where_folded, shows_truly
+from gsx.scenes.lens_folds import Cut, cut_where_folded, project, shows_truly
 
 ROWS_PER_BAND = 256  # rows sampled at a time: bounds the memory of the grid, whatever the photo's height
 OUTSIDE = 1.0
@@ -99,16 +99,10 @@ def refuse_nonsense(camera: Any, pinhole: Any) -> None:
 
 def camera_of(pinhole: Any, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> Camera:
     """Return a pycolmap pinhole camera with a pose camera_from_world as gsx has it, at the same resolution."""
-    return Camera(
-        rotation=rotation,
-        translation=translation,
-        fx=pinhole.focal_length_x,
-        fy=pinhole.focal_length_y,
-        cx=pinhole.principal_point_x,
-        cy=pinhole.principal_point_y,
-        width=pinhole.width,
-        height=pinhole.height,
-    )
+    focal = {"fx": pinhole.focal_length_x, "fy": pinhole.focal_length_y}
+    centre = {"cx": pinhole.principal_point_x, "cy": pinhole.principal_point_y}
+    size = {"width": pinhole.width, "height": pinhole.height}
+    return Camera(rotation=rotation, translation=translation, **focal, **centre, **size)
 
 
 def undistorted_size(intrinsics: Any, pinhole: Any, size: tuple[int, int]) -> tuple[int, int]:
@@ -174,9 +168,7 @@ def _distorted_pixels(intrinsics: Any, pinhole: Any, size: tuple[int, int]) -> I
     rows = (torch.arange(height, dtype=torch.float64) + 0.5) * (pinhole.height / height)
     x = (columns - pinhole.principal_point_x) / pinhole.focal_length_x
     for y in ((rows - pinhole.principal_point_y) / pinhole.focal_length_y).split(ROWS_PER_BAND):
-        grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
-        rays = torch.stack([grid_x, grid_y, torch.ones_like(grid_x)], dim=-1).reshape(-1, 3)
-        yield torch.from_numpy(intrinsics.img_from_cam(rays.numpy())).reshape(len(y), width, 2)
+        yield project(intrinsics, x, y)
 
 
 def sample(photo: Float[Tensor, "C H W"], pixels: Float[Tensor, "h w 2"]) -> Float[Tensor, "C h w"]:

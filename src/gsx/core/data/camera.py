@@ -16,8 +16,6 @@ from gsx.core.errors import InputError
 from gsx.core.shapes import Bool, Float
 
 NEAR = 0.2  # 3D-GS rasterizer: splats at camera depth <= 0.2 scene units are culled
-UPRIGHT = 0.05
-"""How much the mean image-up counts against level horizons; small: horizons win wherever they say anything."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,9 +103,16 @@ class Camera:
     def resize(self, width: int, height: int) -> "Camera":
         """Return the same field of view on another raster; intrinsics scale per axis."""
         sx, sy = width / self.width, height / self.height
-        lens = {"fx": self.fx * sx, "fy": self.fy * sy, "cx": self.cx * sx, "cy": self.cy * sy}
-        frame = self.cut_from and self.cut_from.scaled(sx, sy)
-        return replace(self, **lens, width=width, height=height, cut_from=frame)
+        return replace(
+            self,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+            width=width,
+            height=height,
+            cut_from=self.cut_from and self.cut_from.scaled(sx, sy),
+        )
 
     def zoom(self, factor: float) -> "Camera":
         """Return the same view sampled more finely: `factor` times the focal length and the raster."""
@@ -195,18 +200,14 @@ def pinhole(
     near: float = NEAR,
 ) -> Camera:
     """Return a camera of square pixels with its principal point at the middle of the raster; focal length in px."""
-    pose = {"rotation": rotation, "translation": translation}
-    return Camera(**pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height, near=near)
-
-
-def upright(rotations: Float[Tensor, "K 3 3"]) -> Float[Tensor, "3"]:
-    """Return the up direction: near the mean image-up, and across the images' horizontal axes where those differ.
-
-    Photographers hold cameras level but tilt them: the mean image-up alone leans away from what a half ring surrounds.
-    """
-    right, up = rotations[:, 0], -rotations[:, 1]
-    level = right.T @ right / len(right) + UPRIGHT * torch.eye(3, dtype=right.dtype)
-    solved = torch.linalg.solve(level, up.mean(0))
-    if solved.norm() < 1e-6:  # cameras rolled every way
-        return up[0]
-    return solved / solved.norm()
+    return Camera(
+        rotation=rotation,
+        translation=translation,
+        fx=focal,
+        fy=focal,
+        cx=width / 2,
+        cy=height / 2,
+        width=width,
+        height=height,
+        near=near,
+    )

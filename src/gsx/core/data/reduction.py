@@ -1,8 +1,4 @@
-"""How a coarse picture comes from a finer one: the one image formation that a scene declares, and its adjoint.
-
-Photographs become training pictures by a filter (`resize.resize`). What is known of a finer picture is that the
-same filter takes it to the training picture, without the 8 bits in between.
-"""
+"""Reduction of pictures: the filter by which a scene's photographs become training pictures, and its adjoint."""
 
 from dataclasses import dataclass
 
@@ -38,41 +34,37 @@ class Reduction:
         return REACH.get(self.filter, 0)
 
     def inner(self, low: Float[Tensor, "*C h w"]) -> Float[Tensor, "*C inner_h inner_w"]:
-        """A reduced window without its rim, as far as something is left."""
+        """Return a reduced window without its rim, as far as something is left."""
         down, across = (min(self.rim, (side - 1) // 2) for side in low.shape[-2:])
         return low[..., down : low.shape[-2] - down, across : low.shape[-1] - across]
 
     def reduce(self, image: Float[Tensor, "*C H W"], factor: int) -> Float[Tensor, "*C h w"]:
-        """The picture `factor` times as coarse, differentiable. Box averages of display values are as they come, other
-        results are clamped to [0, 1], like photographs."""
+        """Return the picture `factor` times as coarse, differentiable; all but display box averages in [0, 1]."""
         if factor == 1:
             return image
         low = self.formed(image.clamp(0, 1) if self.light == "linear" else image, factor)
         return low if (self.filter, self.light) == ("area", "display") else low.clamp(0, 1)
 
     def formed(self, image: Float[Tensor, "*C H W"], factor: int) -> Float[Tensor, "*C h w"]:
-        """The same without a clamp: what lies beyond [0, 1] is pulled back by a loss."""
+        """Return the same without a clamp: a loss pulls back what lies beyond [0, 1]."""
         if self.light == "display":
             return self.linear(image, factor)
         return display_from_linear(self.linear(linear_from_display(image), factor), limited=False)
 
     def linear(self, image: Float[Tensor, "*C H W"], factor: int) -> Float[Tensor, "*C h w"]:
-        """The filter alone, on display values or light: D."""
+        """Apply the filter alone, D, to display values or light."""
         planes = image.reshape(-1, 1, *image.shape[-2:])
         if self.filter == "area":
             low = box_average(planes, factor)
         else:
             weights, margin = self.weights(factor, image)
-            rows, columns = (
-                self.sums(planes.shape[2] // factor, factor, image),
-                self.sums(planes.shape[3] // factor, factor, image),
-            )
+            rows, columns = (self.sums(side // factor, factor, image) for side in planes.shape[2:])
             low = conv2d(planes, weights[None, None, None], stride=(1, factor), padding=(0, margin)) / columns
             low = conv2d(low, weights[None, None, :, None], stride=(factor, 1), padding=(margin, 0)) / rows[:, None]
         return low.reshape(*image.shape[:-2], *low.shape[2:])
 
     def adjoint(self, low: Float[Tensor, "*C h w"], factor: int) -> Float[Tensor, "*C H W"]:
-        """D^T: <D x, y> = <x, D^T y>."""
+        """Apply the adjoint D^T: <D x, y> = <x, D^T y>."""
         if self.filter == "area":
             return as_blocks(low, factor) / factor**2
         planes = low.reshape(-1, 1, *low.shape[-2:])
@@ -85,7 +77,7 @@ class Reduction:
         return fine.reshape(*low.shape[:-2], *fine.shape[2:])
 
     def weights(self, factor: int, like: Tensor) -> tuple[Float[Tensor, "L"], int]:
-        """(what a coarse pixel takes of fine ones in a row, how many of these lie beyond its block on each side)."""
+        """Return (what a coarse pixel takes of fine ones in a row, how many lie beyond its block on each side)."""
         reach = REACH[self.filter]
         margin = reach * factor - factor // 2
         distance = (torch.arange(factor + 2 * margin, dtype=torch.float64) + 0.5 - margin) / factor - 0.5
@@ -93,26 +85,26 @@ class Reduction:
         return (weights / weights.sum()).to(like), margin
 
     def sums(self, count: int, factor: int, like: Tensor) -> Float[Tensor, "n"]:
-        """What the weights of each of `count` coarse pixels add up to inside the picture: 1 but at its borders."""
+        """Return what weights of each of `count` coarse pixels add up to inside the picture: 1 but at its borders."""
         weights, margin = self.weights(factor, like)
         ones = torch.ones(1, 1, 1, count * factor, dtype=like.dtype, device=like.device)
         return conv2d(ones, weights[None, None, None], stride=(1, factor), padding=(0, margin)).flatten()
 
 
 def box_average(image: Float[Tensor, "*C H W"], factor: int) -> Float[Tensor, "*C h w"]:
-    """Means over blocks of factor x factor pixels."""
+    """Return means over blocks of factor x factor pixels."""
     return avg_pool2d(image, factor)
 
 
 def as_blocks(image: Float[Tensor, "*C h w"], factor: int) -> Float[Tensor, "*C H W"]:
-    """Every pixel as a block of factor x factor."""
+    """Repeat every pixel as a block of factor x factor."""
     return image.repeat_interleave(factor, -2).repeat_interleave(factor, -1)
 
 
 def projected(
     image: Float[Tensor, "*C H W"], low: Float[Tensor, "*C h w"], factor: int, reduction: Reduction
 ) -> Float[Tensor, "*C H W"]:
-    """The nearest picture that reduces to the given one, clamped to [0, 1]; nearest in light where light is reduced.
+    """Return the nearest picture that reduces to `low`, in [0, 1]; nearest in light where light is reduced.
 
     Errors are spread by the adjoint, round after round; of box averages the first does it, since D D^T = I / a^2, and
     later ones halve what clamping undid.

@@ -19,11 +19,11 @@ class ImageSource(Protocol):
     """Where the truth of one view comes from: a photograph, whose file `path` names, or an analytic scene."""
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
-        """The truth as `camera` sees it; `camera` is the view's own camera at any zoom, or a crop of that."""
+        """Return the truth as `camera` sees it: the view's camera at any zoom, or a crop of that."""
         ...
 
     def max_zoom(self, camera: Camera) -> float:
-        """The largest zoom of `camera` for which there is truth (1.0: only as it is; inf: any)."""
+        """Return the largest zoom of `camera` for which there is truth (1.0: only as it is; inf: any)."""
         ...
 
 
@@ -32,7 +32,7 @@ class Masked(Protocol):
     """A source of which some pixels may not count."""
 
     def counted(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
-        """Which pixels of `image(camera)` count; None: all."""
+        """Return which pixels of `image(camera)` count; None: all."""
         ...
 
 
@@ -41,7 +41,7 @@ class CutOut(Protocol):
     """A source of pictures that may be transparent where they show nothing of the scene."""
 
     def transparent(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
-        """Which pixels of `image(camera)` show the background alone; None: the picture does not tell."""
+        """Return which pixels of `image(camera)` show the background alone; None: unknown."""
         ...
 
 
@@ -91,33 +91,29 @@ class View:
         return file_of(self.source)
 
     def image(self) -> Float[Tensor, "3 H W"]:
-        """The truth at the camera's resolution, display values in [0, 1]."""
+        """Return the truth at the camera's resolution, display values in [0, 1]."""
         return self.picture().float() / 255.0
 
     def picture(self) -> UInt8[Tensor, "3 H W"]:
-        """The truth at the camera's resolution, display values.
-
-        Raises:
-            InputError: the source gives another picture than its camera takes.
-        """
-        found, (width, height) = self.source.image(self.camera), self.camera.size
-        if found.dtype != torch.uint8 or found.shape != (3, height, width):
+        """Return the truth at the camera's resolution, 8 bits; InputError: the source gives another kind of picture."""
+        image, (width, height) = self.source.image(self.camera), self.camera.size
+        if image.dtype != torch.uint8 or image.shape != (3, height, width):
             raise InputError(
-                f"the picture of view '{self.name}' is {found.dtype} {list(found.shape)}, and its camera takes "
+                f"the picture of view '{self.name}' is {image.dtype} {list(image.shape)}, and its camera takes "
                 f"torch.uint8 {[3, height, width]}: its source is to return that"
             )
-        return found
+        return image
 
     def counted(self) -> Bool[Tensor, "H W"] | None:
-        """Which pixels count in losses and figures; None: all. The others show what is not part of the scene."""
+        """Return which pixels count in losses and figures, being part of the scene; None: all."""
         return self.source.counted(self.camera) if isinstance(self.source, Masked) else None
 
     def transparent(self) -> Bool[Tensor, "H W"] | None:
-        """Which pixels show nothing of the scene, by the picture's own alpha; None: it does not tell."""
+        """Return which pixels show nothing of the scene, by the picture's alpha; None: unknown."""
         return self.source.transparent(self.camera) if isinstance(self.source, CutOut) else None
 
     def zoom(self, factor: float) -> "View | None":
-        """The view sampled `factor` times as finely, or None where the data hold no such truth."""
+        """Return the view sampled `factor` times as finely, or None where the data hold no such truth."""
         if factor > self.source.max_zoom(self.camera):
             return None
         return replace(self, camera=self.camera.zoom(factor))
@@ -151,7 +147,7 @@ class Scene:
     reduction: Reduction = Reduction()
     """How its pictures come from finer ones: photographs by their resize rule. The default: box averages."""
     notes: Sequence[str] = ()
-    """What the loader did that a user should know: skipped images, undistortion, fallbacks. Shown at start."""
+    """What a user should know of how it was loaded: skipped images, undistortion, fallbacks. Logged at start."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Subtracted from positions of cameras and points; add it for coordinates of the scene's files."""
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -159,6 +155,6 @@ class Scene:
 
 
 def extent_of(cameras: Sequence[Camera]) -> float:
-    """1.1 x the largest distance of a camera centre from the mean centre, in scene units (3D-GS, getNerfppNorm)."""
+    """Return 1.1 x the largest distance of a camera centre from the mean centre (3D-GS, getNerfppNorm)."""
     centres = torch.stack([camera.centre.double() for camera in cameras])
     return 1.1 * float((centres - centres.mean(0)).norm(dim=1).max())

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsx import __version__
-from gsx.core.data.camera import Camera, upright
+from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import GsxError, InputError
 from gsx.core.gaussians.drawn import splats_of
@@ -25,6 +25,7 @@ from gsx.core.training.run import Run
 from gsx.experiments.reports.viewer_page import viewer_page
 from gsx.experiments.runs.bake import bake
 from gsx.experiments.runs.load_scene import unit_of
+from gsx.experiments.runs.orbit import upright
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.arrays import arrays_of, gaussians_from
 from gsx.formats.axis_names import AUTO

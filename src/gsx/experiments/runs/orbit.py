@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera, look_at, upright
+from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.images import in_memory
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import Scene
@@ -38,6 +38,8 @@ SLOWEST, FASTEST = 0.1, 1000
 """Frames per second of an animation."""
 GIF_FASTEST = 50
 """GIF delays are whole hundredths of a second, and viewers slow down below two of them."""
+UPRIGHT = 0.05
+"""Weight of the mean image-up against level horizons; small: horizons win wherever they say anything."""
 
 
 @dataclass(frozen=True)
@@ -297,3 +299,16 @@ def encode(encoding: Encoding, path: Path, frames: Iterator[UInt8[Tensor, "H W 3
             picture = av.VideoFrame.from_ndarray(frame[:height, :width].contiguous().numpy(), format="rgb24")
             output.mux(stream.encode(picture))
         output.mux(stream.encode())
+
+
+def upright(rotations: Float[Tensor, "K 3 3"]) -> Float[Tensor, "3"]:
+    """Return the up direction: near the mean image-up, and across the images' horizontal axes where those differ.
+
+    Photographers hold cameras level but tilt them: the mean image-up alone leans away from what a half ring surrounds.
+    """
+    right, up = rotations[:, 0], -rotations[:, 1]
+    level = right.T @ right / len(right) + UPRIGHT * torch.eye(3, dtype=right.dtype)
+    solved = torch.linalg.solve(level, up.mean(0))
+    if solved.norm() < 1e-6:  # cameras rolled every way
+        return up[0]
+    return solved / solved.norm()

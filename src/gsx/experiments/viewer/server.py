@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import upright
 from gsx.core.data.images import write_image
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
@@ -24,6 +23,7 @@ from gsx.core.errors import GsxError, InputError
 from gsx.core.gaussians.quaternions import quaternions_of
 from gsx.core.packages import require
 from gsx.core.shapes import Float
+from gsx.experiments.runs.orbit import upright
 from gsx.experiments.viewer.camera_path import CameraPath, Keyframe, write_camera_path
 from gsx.experiments.viewer.pictures import BESIDE, FILTERS, Model, Pose, RunModel, picture
 from gsx.experiments.viewer.screens import FrameServer, Screen
