@@ -81,7 +81,7 @@ def test_the_walls_are_plain_in_the_shade() -> None:
 
 def test_somebody_stands_in_the_room_before_every_camera(options: DemoOptions) -> None:
     """Not behind a wall: each photograph shows them, but for what hides them."""
-    options = replace(options, train_views=6, width=48, height=36, points=20)
+    options = replace(options, points=20)
     walked, empty = room.load(replace(options, passer_by=True)), room.load(options)
     for view, without in zip(walked.train, empty.train, strict=True):
         assert ((view.image() - without.image()).abs().amax(0) > 0.03).float().mean() > 0.02
