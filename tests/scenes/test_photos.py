@@ -3,6 +3,7 @@
 import logging
 import math
 import os
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -419,7 +420,8 @@ def test_progress_is_logged_with_stage_count_and_time(
 ) -> None:
     monkeypatch.setattr(sfm, "LOG_SECONDS", 0.01)
     with caplog.at_level(logging.INFO):
-        assert sfm.watched("matches of pairs", lambda token: time.sleep(0.1) or 42, lambda: 7, 9) == 42
+        logged = threading.Event()  # the stage ends once its progress has been logged
+        assert sfm.watched("matches of pairs", lambda token: logged.wait(60) and 42, lambda: logged.set() or 7, 9) == 42
     assert any(line.startswith("sfm: matches of pairs 7/9, ") for line in caplog.messages)
     assert caplog.messages[-1].startswith("sfm: matches of pairs done")
 
