@@ -125,6 +125,7 @@ class Exposure(Correction):
 
     def __init__(self, options: ExposureOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
+        self.count = len(context.scene.train)
         self.indices = {view.name: index for index, view in reversed([*enumerate(context.scene.train)])}
         """Number of a photo by its name; of photos of one name the first."""
         self.matrices: Float[Tensor, "N 3 4"] | None = None
@@ -138,11 +139,6 @@ class Exposure(Correction):
         """Steps of each photo."""
         self.rendered: set[int] = set()
         """Photos of the step under way."""
-
-    @property
-    def count(self) -> int:
-        """Number of training photos."""
-        return len(self.context.scene.train)
 
     @property
     def active(self) -> bool:

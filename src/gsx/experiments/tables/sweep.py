@@ -21,8 +21,9 @@ from gsx.experiments.runs.overrides import key_of, parse_overrides, refuse_absen
 from gsx.experiments.runs.typed import typed
 from gsx.experiments.tables.datasets import missing
 from gsx.experiments.tables.plan import Cell, Experiment, Plan, cells_of, check_scenes, plan_lines, planned, words_of
+from gsx.experiments.tables.protocol_differences import protocol_differences
 from gsx.experiments.tables.published import read_table
-from gsx.experiments.tables.table import Table, protocol_differences, table_of
+from gsx.experiments.tables.table import Table, table_of
 from gsx.experiments.tables.table_text import as_csv, as_latex, as_markdown, as_text
 
 logger = logging.getLogger(__name__)
