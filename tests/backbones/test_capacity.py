@@ -198,7 +198,7 @@ def test_what_no_view_shows_outlives_a_budget() -> None:
 
 def test_a_budget_takes_as_much_from_what_any_view_shows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Twelve views, each of a place of its own with twenty points: four are asked at an event, all at the last."""
-    monkeypatch.setattr("gsx.backbones.capacity.LOOKS", 4)
+    monkeypatch.setattr("gsx.backbones.capacity.MOST_VIEWS", 4)
     places = [10.0 * i for i in range(12)]
     cameras = [look_at([x, -4, 1], [x, 0, 0], fov_x=0.9, width=24, height=16) for x in places]
     points = torch.cat([spread(20, seed=i) + torch.tensor([x, 0, 0]) for i, x in enumerate(places)])
@@ -246,7 +246,7 @@ def test_masked_windows_tell_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     model = small_gs3d(scene, options=options_of("adaptive"))
     half = with_rows(model.table, torch.arange(40) < 20)
     judge = adaptive(scene)
-    assert judge.tried(model, lambda table: half, 700) == {}
+    assert judge.measure(model, lambda table: half, 700) == {}
     assert judge.gain_of_rows(model, torch.arange(40) < 20, 700) == 0
     assert not len(model.table.record["trials"])
 
