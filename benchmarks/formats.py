@@ -25,13 +25,13 @@ import torch
 from gsx.builtin import plugins
 from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.splats import Gaussians
-from gsx.core.gaussians.turned import turned
 from gsx.core.quality.metrics import psnr
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.runs.export import Exported, as_in_page, export, is_page
 from gsx.experiments.runs.open import open_run
 from gsx.formats.splat_files import read_gaussians
+from gsx.formats.turned import turned
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import stamped, text_table, write_results
 

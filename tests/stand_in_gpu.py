@@ -24,9 +24,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsx.builtin import plugins
-from gsx.core.training.guard import Guard
 from gsx.core.training.trainer import train_step
 from gsx.experiments.runs import build
+from gsx.experiments.runs.guard import Guard
 from gsx.experiments.runs.load_scene import load_scene
 
 DEVICE = torch.device("lazy", 0)

@@ -13,7 +13,7 @@ from gsx.core.training.run import Run
 
 SOURCE = Path(__file__).parents[1] / "src" / "gsx"
 FILES = sorted(SOURCE.rglob("*.py"))
-LOOP = ("core/training/trainer.py", "core/training/run.py", "core/training/checkpoint.py",
+LOOP = ("core/training/trainer.py", "core/training/run.py", "experiments/run_folder/checkpoint.py",
         "experiments/evaluation/evaluator.py")  # fmt: skip
 
 

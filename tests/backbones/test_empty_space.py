@@ -11,9 +11,9 @@ from gsx.backbones.empty_space import in_empty_space
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.images import ImageCache, write_image
 from gsx.core.data.masks import Mask
-from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.resize import ResizeRule
 from gsx.core.data.scene import View
+from gsx.scenes.photo_source import PhotoSource
 
 RADIUS, SIDE = 0.5, 96
 EYES = [(4, 0, 0), (0, 4, 0), (-3, -3, 0.5)]

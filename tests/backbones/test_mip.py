@@ -27,7 +27,6 @@ from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.drawn import splats_of
-from gsx.core.gaussians.smoothing import logit_of_log, smoothed
 from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.losses import photometric
 from gsx.core.quality.metrics import psnr
@@ -42,6 +41,7 @@ from gsx.experiments.runs.export import export
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
 from gsx.formats.ply import read_ply
+from gsx.formats.smoothing import logit_of_log, smoothed
 from gsx.formats.splat_files import read_gaussians
 
 OPTIONS = MipOptions(variance=0.2, kernel=0.1, margin=0.15, near=0.2, every=100, stop=29900)

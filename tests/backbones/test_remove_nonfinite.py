@@ -19,13 +19,13 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.plugins import Plugins, load_plugins
 from gsx.core.rasterizer import RasterSettings, rasterize, touches
 from gsx.core.training.backbone import remove_nonfinite
-from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import named_parameters, table_tensors
 from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.run import Run, TrainingOptions
 from gsx.core.training.sampler import Sampler
 from gsx.core.training.trainer import backward, train_step
 from gsx.core.training.training_views import TrainingViews
+from gsx.experiments.runs.guard import Guard
 
 NEURAL = ("scaffold", "octree_scaffold")
 WITH_QUATS = ("gs3d", "mip_splatting", "octree_gs3d", "octree_gs3d, clone_split")

@@ -13,8 +13,8 @@ import yaml
 from faults.record import record, some
 from faults.test_readers import example_run, problem_of
 from gsx.builtin import plugins
-from gsx.core.training import checkpoint
 from gsx.experiments.reports.report import report_on, write_report
+from gsx.experiments.run_folder import checkpoint
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.open import open_run
 

@@ -29,8 +29,8 @@ from gsx.core.data.images import read_image, write_image
 from gsx.core.data.scene import Scene
 from gsx.core.errors import GsxError
 from gsx.core.gaussians.splats import Gaussians
-from gsx.core.training import checkpoint
 from gsx.experiments.reports.report import write_report
+from gsx.experiments.run_folder import checkpoint
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.inspect import describe

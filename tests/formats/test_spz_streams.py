@@ -16,9 +16,9 @@ from test_compact_files import many, the_splat
 from gsx.backbones.merging import covariances
 from gsx.core.errors import InputError
 from gsx.core.gaussians.sh import harmonics
-from gsx.core.gaussians.turned import spread_directions
 from gsx.formats import zstd
 from gsx.formats.splat_files import SpzForm, compensated, read_gaussians, read_splats, write_gaussians
+from gsx.formats.turned import spread_directions
 
 ARRAYS = [bytes.fromhex(text) for text in ("00100000200000f8ff", "b3", "a68059", "566170", "00c80ec0")]
 """Of the splat in axes rub: positions 1, 2, -0.5, opacity 0.7, colours, scales, rotation."""

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
-from gsx.core.data.coarser import coarser
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import View
 from gsx.core.errors import Stopped
 from gsx.experiments.runs.degraded import patch_of
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
+from gsx.modules.coarser import coarser
 from gsx.modules.distractors import (
     DistractorOptions,
     Distractors,

@@ -9,17 +9,17 @@ from refusals import refused
 
 import gsx
 from gsx.core.data.camera import look_at
-from gsx.core.data.coarser import coarser
 from gsx.core.data.images import ImageCache, read_image, write_image
 from gsx.core.data.masks import Mask, blacked
-from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.resize import ResizeRule
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.quality.losses import ssim_map
 from gsx.core.quality.metrics import psnr, ssim
+from gsx.modules.coarser import coarser
 from gsx.scenes.masked import candidates, masks_named
+from gsx.scenes.photo_source import PhotoSource
 from tests.synthetic_colmap import synthesize, write_scene
 
 NOISE = torch.Generator().manual_seed(3)

@@ -12,13 +12,13 @@ from synthetic_colmap import PINHOLE, colmap_options, synthesize, write_photos, 
 from torch import Tensor
 
 from gsx.core.data.images import read_image, write_image
-from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
 from gsx.experiments.runs.orbit import upright
 from gsx.scenes.colmap import load
 from gsx.scenes.exif import orientation_of
 from gsx.scenes.orientation import WITHOUT_MIRROR, oriented, oriented_camera
+from gsx.scenes.photo_source import PhotoSource
 
 HELD = (6, 1, 8, 3, 6)
 """Orientations of the five photos, by name."""

@@ -8,13 +8,13 @@ import torch
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import ImageCache, image_size
-from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.resize import ResizeRule
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
 from gsx.core.options import without_effect
 from gsx.core.ranges import Interval, Points
+from gsx.scenes.photo_source import PhotoSource
 
 FILE = "snapshots.json"
 FORMAT = SceneFormat(meaning=f"snapshots ({FILE})", sign=FILE, recognise=lambda path: (path / FILE).is_file())

@@ -11,11 +11,11 @@ from gsx.backbones.heads import Heads
 from gsx.backbones.mip import Filter
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
-from gsx.core.gaussians.smoothing import logit_of_log
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import repeat_rows, take_rows
 from gsx.core.shapes import Float, Int
 from gsx.core.training.parameter_table import ParameterTable
+from gsx.formats.smoothing import logit_of_log
 
 LARGEST_LOG_SCALE = 30.0
 """Lengths are held below e^30 world units, so that their squares stay finite in float32."""

@@ -15,10 +15,10 @@ from gsx.backbones.mip import Filter
 from gsx.backbones.sampling import quantile, sampled_means
 from gsx.backbones.sky import not_sky
 from gsx.backbones.visibility import everything, extents
-from gsx.core.gaussians.smoothing import logit_of_log
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Backbone, BackboneContext, DrawnSplats
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows, keep_rows, reset_column
+from gsx.formats.smoothing import logit_of_log
 
 
 class DensityControl:

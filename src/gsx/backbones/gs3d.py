@@ -26,7 +26,6 @@ from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
 from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.sh import colours_of, constant_from_colour, degree_of
-from gsx.core.gaussians.smoothing import logit_of_log, unsmoothed
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering, goes_compiled
 from gsx.core.shapes import Float, Int
@@ -34,6 +33,7 @@ from gsx.core.training.backbone import BackboneContext, DrawnSplats, Observation
 from gsx.core.training.importance import Probe, random_views
 from gsx.core.training.parameter_table import ParameterTable, take_adam_step
 from gsx.core.training.schedule import log_linear
+from gsx.formats.smoothing import logit_of_log, unsmoothed
 from gsx.formats.splat_files import columns_of
 
 

@@ -14,7 +14,6 @@ from torch.nn.functional import logsigmoid
 
 from gsx.core.data.camera import Camera
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.gaussians.smoothing import LEAST_SHARE, logit_of_log, smoothed
 from gsx.core.ranges import Interval, Range, Steps
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
@@ -22,6 +21,7 @@ from gsx.core.training.backbone import BackboneContext
 from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.schedule import Schedule
+from gsx.formats.smoothing import LEAST_SHARE, logit_of_log, smoothed
 
 FILTERS = ("none", "mip", "magnified", "resampled")
 RATES = ("release", "paper")

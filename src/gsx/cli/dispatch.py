@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         unicode = sys.stdout.encoding.lower().startswith("utf")  # then only bytes of file names are no letters of it
         sys.stdout.reconfigure(errors="surrogateescape" if unicode else "backslashreplace")
     if processes() > 1:
-        from gsx.core.training.distributed import run_together
+        from gsx.engine.joined_ranks import run_together
 
         return run_together(lambda: dispatch_together(arguments), explained)
     try:

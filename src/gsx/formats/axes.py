@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from gsx.core.gaussians.splats import Gaussians
-from gsx.core.gaussians.turned import turned
 from gsx.core.shapes import Float
 from gsx.formats.axis_names import SYSTEMS, TRAINED
+from gsx.formats.turned import turned
 
 QUARTER = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
 """Rotation from (x, y, z) to (x, z, -y)."""

@@ -7,10 +7,10 @@ import torch
 
 from gsx.core.errors import InputError
 from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
-from gsx.core.gaussians.turned import product, turned_harmonics
 from gsx.core.shapes import Float
 from gsx.formats.arrays import Arrays
 from gsx.formats.gltf_asset import LARGEST, Entry, entry_at, list_in, numbers_in
+from gsx.formats.turned import product, turned_harmonics
 
 SHEAR = 1e-3
 """Cosine between a node's axes up to which they count as orthogonal."""

@@ -9,9 +9,9 @@ import torch
 from gsx.core.data.resize import display_from_linear
 from gsx.core.gaussians.bands import BAND_0
 from gsx.core.gaussians.sh import harmonics
-from gsx.core.gaussians.turned import DIRECTIONS, spread_directions
 from gsx.core.shapes import Float
 from gsx.formats.arrays import Arrays
+from gsx.formats.turned import DIRECTIONS, spread_directions
 
 logger = logging.getLogger(__name__)
 

@@ -17,8 +17,8 @@ from torch.nn.functional import avg_pool2d, grid_sample
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.masks import grown
-from gsx.core.gaussians.turned import cross_matrix
 from gsx.core.shapes import Bool, Float
+from gsx.formats.turned import cross_matrix
 from gsx.modules.shifts import ALIKE, BORDER, LEAST, SMALLEST, by_medians, central, grey, robust
 
 ROUNDS, ENOUGH = 10, 0.02

@@ -15,7 +15,6 @@ from typing import Annotated, Any, ClassVar
 import torch
 from torch import Tensor
 
-from gsx.core.data.coarser import coarser
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.quality.sharpness import against_neighbours, fineness
@@ -23,6 +22,7 @@ from gsx.core.ranges import Range, Share
 from gsx.core.training.module import ModuleContext
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.modules.coarser import coarser
 from gsx.modules.corrections import Correction, CorrectionOptions, Times
 from gsx.modules.motion_blur import Movement, movement_between
 from gsx.modules.movement import blurred_to_learn

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from gsx.core.data.coarser import coarser
 from gsx.core.data.scene import View
 from gsx.core.ranges import Range, Share
 from gsx.core.training.module import ModuleContext, TrainingModule
+from gsx.modules.coarser import coarser
 from gsx.modules.corrections import ViewCache
 
 

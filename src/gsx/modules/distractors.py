@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.coarser import CoarseSource, coarser
 from gsx.core.data.scene import CutOut, DerivedSource, View
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Int
@@ -22,6 +21,7 @@ from gsx.core.training.importance import Probe
 from gsx.core.training.module import ModuleContext
 from gsx.core.training.parameter_table import keep_rows
 from gsx.core.training.run import Run
+from gsx.modules.coarser import CoarseSource, coarser
 from gsx.modules.corrections import Correction, CorrectionOptions, Times, ViewCache, ViewCount, sample
 from gsx.modules.distractor_masks import Difference, difference_of, distractors_in
 from gsx.modules.photo_pairs import REDUCTION, gains, match_brightness, render_reduced

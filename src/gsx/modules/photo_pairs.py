@@ -6,12 +6,12 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from gsx.core.data.coarser import coarser
 from gsx.core.data.scene import View
 from gsx.core.rasterizer import TiledRendering
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.modules.coarser import coarser
 
 Pair: TypeAlias = tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"], Bool[Tensor, "H W"] | None]
 """Render, photo, mask of the pixels that count (None: all)."""

@@ -18,15 +18,15 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.coarser import coarser
 from gsx.core.data.scene import View
-from gsx.core.gaussians.turned import cross_matrix
 from gsx.core.ranges import Range
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.module import ModuleContext
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.formats.turned import cross_matrix
 from gsx.modules.alignment import Motion, aligned, motion_to, rotation_by, usual_depth
+from gsx.modules.coarser import coarser
 from gsx.modules.corrections import Correction, CorrectionOptions, Times, ViewCache, ViewCount, sample
 from gsx.modules.photo_pairs import REDUCTION, render_reduced, shared_spread
 from gsx.modules.pinned import posed

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera, pinhole
 from gsx.core.data.images import image_size
-from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
@@ -28,6 +27,7 @@ from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.origin import origin_of_cameras, point_looked_at
 from gsx.scenes.photo_names import plain_name
+from gsx.scenes.photo_source import PhotoSource
 from gsx.scenes.points import random_points, stored_points
 from gsx.scenes.pose_files import frames_line, pose_from_opengl, present_frames, read_frames
 from gsx.scenes.posed import Shot, check_sides, scene_of, views_of

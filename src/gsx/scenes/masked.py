@@ -8,7 +8,6 @@ from typing import Any
 
 from gsx.core.data.images import has_alpha, image_size, is_reduction
 from gsx.core.data.masks import INTERPOLATED, Mask
-from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.resize import Size
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError
@@ -16,6 +15,7 @@ from gsx.core.files import at_home, is_file
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.orientation import INVERSES, Turns, oriented_size
 from gsx.scenes.photo_names import SUFFIXES
+from gsx.scenes.photo_source import PhotoSource
 from gsx.scenes.undistort import StoredUndistortion
 
 IMAGES = "images"

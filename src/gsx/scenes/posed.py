@@ -11,7 +11,6 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import ImageCache, image_size, refuse_other_size
-from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.resize import ResizeRule, Size, training_size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
@@ -22,6 +21,7 @@ from gsx.scenes.duplicates import refuse_shared
 from gsx.scenes.masked import mask_of, masks_named
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.orientation import AFTER_MIRROR, Turned, Turns, TurnsOf, of_model, oriented_camera, oriented_size
+from gsx.scenes.photo_source import PhotoSource
 from gsx.scenes.pose_files import some_names
 from gsx.scenes.undistort import StoredUndistortion, camera_of, cut_of, pinhole_of, undistorted_size
 

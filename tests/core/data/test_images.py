@@ -16,9 +16,9 @@ from torch import Tensor
 from gsx.core.data import images
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import ImageCache, composite, image_size, read_image, write_image
-from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.resize import ResizeRule, display_from_linear, linear_from_display, resize, to_uint8, training_size
 from gsx.core.errors import ConfigError, InputError
+from gsx.scenes.photo_source import PhotoSource
 
 RULE = ResizeRule(filter="bicubic", light="display", background=(1.0, 1.0, 1.0))
 

@@ -23,14 +23,15 @@ from gsx.cli.dispatch import main
 from gsx.core.errors import ConfigError, Disagreement
 from gsx.core.plugins import load_plugins
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.training.distributed import Ranks, current_ranks
-from gsx.core.training.guard import Agreement
+from gsx.core.training.distributed import Ranks
 from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.run import Run, TrainingOptions
 from gsx.core.training.sampler import Sampler
 from gsx.core.training.trainer import train_step
 from gsx.core.training.training_views import TrainingViews
+from gsx.engine.joined_ranks import current_ranks
 from gsx.experiments.runs.build import placed, refuse_uneven
+from gsx.experiments.runs.guard import Agreement
 
 COMMON = ("rasterizer=eager", "iterations=20", "training.batch=2", "training.checkpoint_every=8")
 GS3D = (*COMMON, "backbone.density.every=400", "backbone.density.reset_passes=1", "backbone.density.gradient=1e-6",

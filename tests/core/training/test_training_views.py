@@ -14,7 +14,6 @@ from gsx.backbones.adaptive import Adaptive, AdaptiveOptions
 from gsx.backbones.capacity import EventSteps
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
-from gsx.core.data.coarser import coarser
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
@@ -24,6 +23,7 @@ from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
 from gsx.modules.coarse_to_fine import CoarseToFine, CoarseToFineOptions
+from gsx.modules.coarser import coarser
 
 
 class Noise:

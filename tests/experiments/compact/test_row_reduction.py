@@ -13,11 +13,11 @@ from gsx.backbones.gs3d import GS3D
 from gsx.backbones.merging import surfaces
 from gsx.core.data.camera import Camera
 from gsx.core.gaussians.sh import colour_of_constant
-from gsx.core.gaussians.smoothing import smoothed
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import rasterize
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows
 from gsx.experiments.compact.reduction import Reduction, cheapest, pairs_of
+from gsx.formats.smoothing import smoothed
 
 STEP = 30000
 

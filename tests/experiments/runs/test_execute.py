@@ -16,8 +16,8 @@ from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.errors import CheckpointError, ConfigError, InputError, LostModel
 from gsx.core.plugins import hookimpl
-from gsx.core.training import checkpoint
 from gsx.core.training.run import Run
+from gsx.experiments.run_folder import checkpoint
 from gsx.experiments.runs.evaluate import remedies
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start

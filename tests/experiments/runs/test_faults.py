@@ -25,9 +25,10 @@ from gsx.core import files
 from gsx.core.errors import CompilerError, TrainingError
 from gsx.core.files import remove_partial, replacing
 from gsx.core.plugins import hookimpl
-from gsx.core.training import checkpoint, trainer
+from gsx.core.training import trainer
 from gsx.core.training.run import Run
 from gsx.engine.compiling import available
+from gsx.experiments.run_folder import checkpoint
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs import execute as execution
 from gsx.experiments.runs import verified
@@ -130,7 +131,7 @@ def test_a_disk_that_stays_full_does_not_hide_the_error(
 ) -> None:
     settings, loaded = tiny_settings(tmp_path / "run", *SHORT), plugins()
     run = start(settings, loaded)
-    monkeypatch.setattr("gsx.core.training.checkpoint.write", at_call(1, checkpoint.write, full_disk()))
+    monkeypatch.setattr("gsx.experiments.run_folder.checkpoint.write", at_call(1, checkpoint.write, full_disk()))
     with loaded.listening([Raises(RuntimeError("first"), 5)]), pytest.raises(RuntimeError, match="first"):
         execute(run, settings, loaded)
     assert "the checkpoint of step 5 could not be kept" in caplog.text
@@ -302,7 +303,8 @@ def test_a_damaged_photograph_is_told_before_a_folder_exists(
 )
 def test_a_sidecar_with_numbers_of_no_step_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
     """The digest is that of the tensors: numbers beside it are looked at by themselves."""
-    from gsx.core.training.checkpoint import sound, step_of
+    from gsx.core.training.checkpoint_files import step_of
+    from gsx.experiments.run_folder.checkpoint import sound
 
     sidecar = tmp_path / "step_0000004.json"
     meta = {"step": 4, "seconds": 0.5, "orders": 1, "sampler": [0, 1], "views": {"train": ["a", "b"], "test": ["c"]}}
@@ -311,7 +313,7 @@ def test_a_sidecar_with_numbers_of_no_step_is_refused(tmp_path: Path, change: di
 
 
 def test_other_files_beside_checkpoints_are_none(tmp_path: Path) -> None:
-    from gsx.core.training.checkpoint import sidecars
+    from gsx.core.training.checkpoint_files import sidecars
 
     for name in ("step_0000004.json", "step_copy.json", "step_.json"):
         (tmp_path / name).write_text("{}")

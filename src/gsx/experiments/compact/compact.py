@@ -14,13 +14,13 @@ from gsx.core.errors import InputError, command
 from gsx.core.files import read_json, replace_file, write_json
 from gsx.core.plugins import Plugins
 from gsx.core.seeds import derived_seed
-from gsx.core.training import checkpoint
 from gsx.core.training.run import Run
 from gsx.experiments.compact.fine_tuning import drop_bands
 from gsx.experiments.compact.quality import QUANTISED, write_files, zoomed_psnr
 from gsx.experiments.compact.shrink import Search, ShrinkOptions
 from gsx.experiments.evaluation.remarks import measures_nothing
 from gsx.experiments.reports.overview import write_overview
+from gsx.experiments.run_folder import checkpoint
 from gsx.experiments.run_folder.claims import LOCK, claimed
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.compose import compose

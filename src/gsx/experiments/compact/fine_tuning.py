@@ -11,12 +11,12 @@ from gsx.core.data.scene import Scene, View
 from gsx.core.gaussians.sh import degree_of
 from gsx.core.plugins import Plugins
 from gsx.core.training.backbone import Backbone
-from gsx.core.training.guard import Guard
 from gsx.core.training.module import Modules
 from gsx.core.training.parameter_table import ParameterTable, edit
 from gsx.core.training.run import Run
 from gsx.core.training.sampler import Sampler
 from gsx.core.training.trainer import train_step
+from gsx.experiments.runs.guard import Guard
 
 ONE_IN = 8
 """One of this many training views validates."""

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from gsx.backbones.merging import PARAMETERS, Rows, changes, densities, merged
 from gsx.backbones.neighbours import nearest
-from gsx.core.gaussians.smoothing import smoothed_raw, unsmoothed
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import (
     ParameterTable,
@@ -23,6 +22,7 @@ from gsx.core.training.parameter_table import (
     keep_rows,
     second_moments,
 )
+from gsx.formats.smoothing import smoothed_raw, unsmoothed
 
 ROUND = 0.25
 """Share of the rows that go in one round."""

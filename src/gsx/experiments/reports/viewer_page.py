@@ -17,10 +17,10 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.gaussians.splats import Gaussians
-from gsx.core.gaussians.turned import rotation_between, turned
 from gsx.core.shapes import Float
 from gsx.formats.arrays import arrays_of
 from gsx.formats.compressed_ply import encode_compressed_ply
+from gsx.formats.turned import rotation_between, turned
 
 TEMPLATE = "viewer_page.html.xz"
 PLACE = '"GSX_BOOTSTRAP"'

@@ -15,11 +15,11 @@ from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.errors import InputError
 from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
 from gsx.core.gaussians.sh import BAND_0, harmonics
-from gsx.core.gaussians.smoothing import logit_of_log
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import Bakeable
 from gsx.core.training.run import Run
+from gsx.formats.smoothing import logit_of_log
 
 DEGREE = 2
 """Of the harmonics."""

@@ -17,7 +17,7 @@ from gsx.core.gaussians.splats import Gaussians
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
-from gsx.core.training.distributed import Ranks, current_ranks
+from gsx.core.training.distributed import Ranks
 from gsx.core.training.module import ModuleContext, Modules
 from gsx.core.training.photo_cache import PhotoCache, room_for_photos
 from gsx.core.training.regenerator import Regenerator
@@ -26,6 +26,7 @@ from gsx.core.training.sampler import Sampler
 from gsx.core.training.training_views import TrainingViews
 from gsx.engine.allocator import keep_freed_memory
 from gsx.engine.cache import MANIFEST, cache_folder, content_key, make_folder
+from gsx.engine.joined_ranks import current_ranks
 from gsx.engine.machine import processor_kind
 from gsx.engine.threads import watch_cores
 from gsx.experiments.run_folder.general_options import splat_file

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
-from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.resize import linear_from_display
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.quality.sharpness import sharpness_line
 from gsx.core.shapes import Bool, Float
 from gsx.experiments.runs.load_scene import in_one_place
 from gsx.experiments.runs.orbit import axes_about, nearest_to_rays, upright
+from gsx.scenes.photo_source import PhotoSource
 
 POINTS = 3000
 """Points that are looked up, evenly over all."""

@@ -10,20 +10,20 @@ from typing import Any
 from gsx.core.errors import CompilerError, LostModel, first_line
 from gsx.core.files import read_json, remove_partial, write_json
 from gsx.core.plugins import Plugins, hookimpl
-from gsx.core.training import checkpoint
-from gsx.core.training.guard import Agreement, Guard
 from gsx.core.training.run import Run, StepResult
 from gsx.core.training.trainer import train
 from gsx.engine.cache import cache_root, trim
 from gsx.engine.compile_cache import training_clock
 from gsx.experiments.evaluation.remarks import CapNotice
 from gsx.experiments.reports.report import write_report
+from gsx.experiments.run_folder import checkpoint
 from gsx.experiments.run_folder.claims import claimed
 from gsx.experiments.run_folder.files import SPLATS
 from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.environment import announce
 from gsx.experiments.runs.evaluate import evaluate
 from gsx.experiments.runs.export import export
+from gsx.experiments.runs.guard import Agreement, Guard
 from gsx.experiments.runs.open import as_trained, open_run, refuse_other, refuse_training
 from gsx.experiments.runs.progress import MetricsLog, Progress
 from gsx.experiments.runs.rasterizer_path import warm

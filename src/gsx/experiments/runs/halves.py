@@ -22,13 +22,13 @@ from gsx.core.plugins import load_plugins
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
 from gsx.core.training.backbone import Backbone
-from gsx.core.training.guard import Guard
 from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.sampler import Sampler
 from gsx.core.training.trainer import train_step
 from gsx.core.training.training_views import TrainingViews
+from gsx.experiments.runs.guard import Guard
 
 logger = logging.getLogger(__name__)
 

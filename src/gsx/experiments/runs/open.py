@@ -14,13 +14,13 @@ from gsx.core.files import keep_names, read_json, write_json
 from gsx.core.packages import require
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.training import checkpoint
 from gsx.core.training.augmenter import recall_accounts
-from gsx.core.training.distributed import current_ranks
 from gsx.core.training.run import Run
 from gsx.engine.cache import source_revision
 from gsx.engine.collector import gc_paused
+from gsx.engine.joined_ranks import current_ranks
 from gsx.experiments.evaluation.lpips import load_lpips
+from gsx.experiments.run_folder import checkpoint
 from gsx.experiments.run_folder.claims import LOCK, claimed
 from gsx.experiments.run_folder.files import RunFiles, read_run
 from gsx.experiments.run_folder.run_key import composition_key, finished, other_revision, place_of, trained_on

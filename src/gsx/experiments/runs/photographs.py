@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.masks import blacked
-from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.scene import View
 from gsx.core.files import write_json
 from gsx.core.plugins import Plugins
@@ -29,6 +28,7 @@ from gsx.experiments.runs.progress import Countdown
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.modules.corrections import Correction
 from gsx.modules.shifts import shift_of
+from gsx.scenes.photo_source import PhotoSource
 
 FOLDER = "photographs"
 """Of the run's, with index.json and pictures of the worst."""

@@ -8,11 +8,11 @@ from contextlib import suppress
 from pathlib import Path
 
 from gsx.core.data.images import read_image
-from gsx.core.data.photo_source import PhotoSource
 from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError
 from gsx.core.files import write_json
 from gsx.engine.cache import cache_folder, content_key, enlist, file_stamp, whole
+from gsx.scenes.photo_source import PhotoSource
 
 logger = logging.getLogger(__name__)
 

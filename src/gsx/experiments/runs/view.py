@@ -8,8 +8,8 @@ from pathlib import Path
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.training import checkpoint
 from gsx.engine.threads import watch_cores
+from gsx.experiments.run_folder import checkpoint
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.progress import read_curves

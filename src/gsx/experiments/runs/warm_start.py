@@ -15,10 +15,10 @@ from typing import Any
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, replace_file, replace_text, write_json
 from gsx.core.plugins import hookimpl
-from gsx.core.training import checkpoint
 from gsx.core.training.run import Run, StepResult
 from gsx.engine.cache import cache_folder, content_key, enlist, file_stamp, make_folder, source_revision, trim, whole
 from gsx.engine.machine import machine_stamp
+from gsx.experiments.run_folder import checkpoint
 from gsx.experiments.run_folder.run_key import scene_stamp, trained
 
 logger = logging.getLogger(__name__)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, refuse_lfs_pointer, replace_file, write_json
+from gsx.core.training.checkpoint_files import sidecars, step_of
 from gsx.core.training.parameter_table import restored_table, table_tensors
 from gsx.core.training.run import Run
 
@@ -77,16 +78,6 @@ def refuse_other_views(run: Run, trained: dict[str, list[str]]) -> None:
                 f"{run.folder} was trained with other {part} views (now {len(names)}, then {len(trained[part])}; "
                 f"first difference: {changed[0] if changed else 'their order'}): restore the scene and its split"
             )
-
-
-def sidecars(folder: Path) -> list[Path]:
-    """Sidecars of a checkpoint folder, oldest first."""
-    return sorted(path for path in folder.glob("step_*.json") if path.stem.removeprefix("step_").isdecimal())
-
-
-def step_of(sidecar: Path) -> int:
-    """The step a checkpoint was written at."""
-    return int(sidecar.stem.removeprefix("step_"))
 
 
 def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:

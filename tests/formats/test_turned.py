@@ -7,7 +7,7 @@ from torch.nn.functional import normalize
 from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
 from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Gaussians
-from gsx.core.gaussians.turned import rotation_between, turned
+from gsx.formats.turned import rotation_between, turned
 
 
 def random_rotations(count: int, seed: int = 0) -> torch.Tensor:

@@ -16,13 +16,13 @@ from gsx.core.errors import TrainingError
 from gsx.core.plugins import Plugins, hookimpl, load_plugins
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
-from gsx.core.training.guard import Guard
 from gsx.core.training.parameter_table import gradients, keep_rows, table_tensors
 from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.run import Run, StepResult, TrainingOptions
 from gsx.core.training.sampler import Sampler
 from gsx.core.training.trainer import train, train_step
 from gsx.core.training.training_views import TrainingViews
+from gsx.experiments.runs.guard import Guard
 
 
 class Poisoned(GS3D):
@@ -103,7 +103,7 @@ def test_a_poisoned_step_changes_nothing_and_names_the_culprit(
     with plugins.listening([Guard()]):
         assert train_step(run, plugins).skipped == ""
         before = state(run)
-        with caplog.at_level(logging.WARNING, "gsx.core.training.guard"):
+        with caplog.at_level(logging.WARNING, "gsx.experiments.runs.guard"):
             bad = train_step(run, plugins)
         assert bad.skipped == reason
         assert f"step 2 on view {bad.view.name} skipped: {reason}" in caplog.text
