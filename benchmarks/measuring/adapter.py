@@ -10,13 +10,12 @@ from torch import Tensor
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.rasterizer.composite import composite, make_blocks
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import TileIntersections, intersect_tiles
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.shapes import Float
 from gsx.engine import compiled
-from gsx.engine.compiled import composite_compiled
+from gsx.engine.compositors import COMPOSITORS
 from gsx.engine.kernels import Kernels, Rules
 from gsx.experiments.runs.compose import compose
 from measuring.stages import StageClock
@@ -56,10 +55,7 @@ def blend_pairs(
 ) -> Float[Tensor, "C H W"]:
     """Blended channels, differentiable in means, factors, log-opacities and channels of the screen splats."""
     grid = TileGrid.of(camera, settings.tile_size)
-    inputs = (screen.means, screen.conic_factors, screen.log_opacities, screen.channels)
-    if settings.path == "compiled":
-        return composite_compiled(*inputs, pairs, grid, settings)[0][:-1]
-    return composite(*inputs, make_blocks(pairs, settings.chunk, len(screen.ids)), grid, settings)[:-1]
+    return COMPOSITORS[settings.path](screen, screen.channels, pairs, grid, settings)[0][:-1]
 
 
 def blend_screen(

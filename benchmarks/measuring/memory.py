@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 
 from gsx.core.rasterizer import RasterSettings
+from gsx.engine.compositors import COMPOSITORS
 from measuring.cases import Case, drawing
 from measuring.watches import Job
 
@@ -107,7 +108,7 @@ def peak_memory(path: str, case: Case, device: torch.device, settings: RasterSet
         return {}
     if device.type == "cuda":
         return peaks(drawing(path, case, device, settings), device)
-    task = json.dumps({"path": path, "case": asdict(case), "settings": asdict(settings)})
+    task = json.dumps({"path": path, "case": asdict(case), "settings": settings.options})
     threads = {"OMP_NUM_THREADS": str(torch.get_num_threads())}
     command = [sys.executable, "-m", "measuring.memory", task]
     done = subprocess.run(command, cwd=FOLDER, env=os.environ | threads, stdout=subprocess.PIPE, text=True, check=True)
@@ -117,7 +118,9 @@ def peak_memory(path: str, case: Case, device: torch.device, settings: RasterSet
 def main(task: str) -> None:
     """Draw once to compile and to load what is loaded late, then measure."""
     given, device = json.loads(task), torch.device("cpu")
-    job = drawing(given["path"], Case(**given["case"]), device, RasterSettings(**given["settings"]))
+    job = drawing(
+        given["path"], Case(**given["case"]), device, RasterSettings(**given["settings"], compositors=COMPOSITORS)
+    )
     job(HostPeaks())
     sys.stdout.write(json.dumps(peaks(job, device)) + "\n")
 

@@ -11,6 +11,7 @@ def gsx_register(registry: Registry) -> None:
     """Registers scenes, backbones, modules, augmenters, regenerators and trackers of gsx itself."""
     for add in (add_scenes, add_backbones, add_modules, add_augmenters, add_regenerators, add_diffusion, add_trackers):
         add(registry)
+    add_compositors(registry)
 
 
 def add_scenes(registry: Registry) -> None:
@@ -71,6 +72,15 @@ def add_regenerators(registry: Registry) -> None:
     registry.add("regenerator", "scene_sr", SceneSR, SceneSROptions)
     registry.add("regenerator", "scene_restorer", SceneRestorer, RestorerOptions)
     registry.add("regenerator", "callable", Called, CalledOptions)
+
+
+def add_compositors(registry: Registry) -> None:
+    """Registers what blends splats: eager torch, compiled loops, pixel windows, gsplat."""
+    from gsx.core.rasterizer.compositor import NoOptions
+    from gsx.engine.compositors import COMPOSITORS
+
+    for name, compositor in COMPOSITORS.items():
+        registry.add("compositor", name, lambda options, made=compositor: made, NoOptions)
 
 
 def add_diffusion(registry: Registry) -> None:

@@ -32,7 +32,7 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.quality.losses import volume_loss
-from gsx.core.rasterizer import Rendering, goes_compiled, touches
+from gsx.core.rasterizer import Rendering, touches
 from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import BackboneContext, Observation
 from gsx.core.training.parameter_table import Networks, ParameterTable, take_adam_step
@@ -144,7 +144,7 @@ class Anchors(SceneModel):
             camera=camera,
             view=view_number(self.numbers, self.context.views, camera, step),
             sh_degree=degree,
-            compiled=goes_compiled(self.raster, weights.device.type),
+            backend=self.raster.backend.on(weights.device.type, learning=True),
         )
 
     def regulariser(self, drawn: DrawnAnchors) -> Float[Tensor, ""] | None:

@@ -9,6 +9,7 @@ from torch.nn.functional import logsigmoid, normalize
 
 from gsx.backbones.heads import Heads
 from gsx.backbones.mip import Filter
+from gsx.core.backend import EAGER, Backend
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
 from gsx.core.gaussians.splats import Gaussians, Splats
@@ -36,8 +37,8 @@ class VisibleAnchors:
     view: int
     """Number of the training view, -1 for any other camera."""
     sh_degree: int
-    compiled: bool = False
-    """Whether their colours go the compiled way."""
+    backend: Backend = EAGER
+    """What computes their colours."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -185,7 +186,7 @@ class Explicit:
             scales=scales,
             quats=row["quats"],
             log_opacities=log_opacities,
-            colours=colours_of(row["sh_dc"], row["sh_rest"], offsets, visible.sh_degree, visible.compiled),
+            colours=colours_of(row["sh_dc"], row["sh_rest"], offsets, visible.sh_degree, visible.backend),
         )
         return Decoded(splats=splats, slots=rows, opacities=opacities)
 

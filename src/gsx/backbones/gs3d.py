@@ -21,13 +21,14 @@ from gsx.backbones.scene_model import SceneModel
 from gsx.backbones.sh_degrees import ChosenDegrees, choose_degrees, hold_bands, lower_degrees, numbers_of
 from gsx.backbones.sky import NOTHING, SKY_OPACITY, WIDEST, far_away, sky_behind
 from gsx.backbones.visibility import Shown, Visibility, everything, extents
+from gsx.core.backend import EAGER, Backend
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
 from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.sh import colours_of, constant_from_colour, degree_of
 from gsx.core.gaussians.splats import Gaussians, Splats
-from gsx.core.rasterizer import Rendering, goes_compiled
+from gsx.core.rasterizer import Rendering
 from gsx.core.shapes import Float, Int
 from gsx.core.training.backbone import BackboneContext, DrawnSplats, Observation
 from gsx.core.training.importance import Probe, random_views
@@ -66,11 +67,11 @@ def raw_parameters(gaussians: Gaussians, sh_degree: int) -> dict[str, Tensor]:
 
 
 def colours_from(
-    camera: Camera, values: Mapping[str, Tensor], degree: int, compiled: bool = False
+    camera: Camera, values: Mapping[str, Tensor], degree: int, backend: Backend = EAGER
 ) -> Float[Tensor, "M 3"]:
     """Evaluates colours of Gaussians as seen from a camera, up to a degree."""
     offsets = offsets_from(values["means"], camera.centre)
-    return colours_of(values["sh_dc"], values["sh_rest"], offsets, degree, compiled)
+    return colours_of(values["sh_dc"], values["sh_rest"], offsets, degree, backend)
 
 
 def choose_sh_degrees(model: "GS3D", step: int) -> dict[str, float]:
@@ -169,13 +170,13 @@ class GS3D(SceneModel):
         shown = self.visibility.shown(self.table, camera, step)
         values = shown.values
         scales, log_opacities = extents(self.table, shown, self.filter)
-        compiled = goes_compiled(self.raster, scales.device.type)
+        backend = self.raster.backend.on(scales.device.type, learning=True)
         splats = Splats(
             means=values["means"],
             scales=scales,
             quats=values["quats"],
             log_opacities=log_opacities,
-            colours=colours_from(camera, values, self.active_degree(step), compiled),
+            colours=colours_from(camera, values, self.active_degree(step), backend),
         )
         return DrawnSplats(splats=splats, rows=shown.rows)
 

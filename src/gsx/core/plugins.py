@@ -24,7 +24,7 @@ GROUP = "gsx"
 """Entry-point group and pluggy project name."""
 BLOCK = "GSX_NO_PLUGINS"
 """Environment variable: when set and not empty, only built-ins are loaded."""
-KINDS = ("scene", "backbone", "module", "augmenter", "regenerator", "tracker")
+KINDS = ("scene", "backbone", "module", "augmenter", "regenerator", "tracker", "compositor")
 
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from threading import Thread
 
 import torch
@@ -19,7 +19,9 @@ from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, rasterize
+from gsx.engine.backend import COMPILED
 from gsx.engine.compile_cache import Call, lacking, make_ahead, place, recorded
+from gsx.engine.compositors import COMPOSITORS
 
 WARM_SPLATS, WARM_SIZE = 2000, (128, 96)
 """Of the picture whose drawing compiles everything: lists of several chunks in several groups."""
@@ -67,11 +69,11 @@ def draw_one(step: Step, device: torch.device) -> None:
     """Takes a small picture through all that a step compiles."""
     splats, degree = warm_splats(device), step.sh_degree
     rest = Parameter(torch.zeros(len(splats), (degree + 1) ** 2 - 1, 3, device=device))
-    colours = colours_of(splats.colours[:, None], rest, splats.means, degree, compiled=True)
+    colours = colours_of(splats.colours[:, None], rest, splats.means, degree, COMPILED)
     as_training = replace(step.settings, training_focal=0.0)
     drawn = replace(splats, colours=colours)
     image = rasterize(drawn, warm_camera(), as_training, absolute_gradient=step.absolute_gradient).image
-    photometric(image, torch.zeros(image.shape, device=device), 0.2, compiled=True).backward()
+    photometric(image, torch.zeros(image.shape, device=device), 0.2, COMPILED).backward()
 
 
 def warm_camera() -> Camera:
@@ -104,10 +106,10 @@ def helper(step: Step, wanted: bool = True) -> Iterator[None]:
     """
     process = None
     if wanted and torch.get_num_threads() > 1:
-        words = json.dumps(asdict(step) | {"threads": torch.get_num_threads()})
+        fields = vars(step) | {"settings": step.settings.options, "threads": torch.get_num_threads()}
         with suppress(OSError):
             process = subprocess.Popen(
-                [sys.executable, "-P", "-c", HELPER, words],
+                [sys.executable, "-P", "-c", HELPER, json.dumps(fields)],
                 stdin=subprocess.PIPE,  # its end tells the process to stop, also if this one is killed
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
@@ -134,7 +136,7 @@ def help_compiling(words: str) -> None:
     Thread(target=end_with_input, daemon=True).start()
     fields = json.loads(words)
     torch.set_num_threads(fields.pop("threads"))
-    step = Step(**fields | {"settings": RasterSettings(**fields["settings"])})
+    step = Step(**fields | {"settings": RasterSettings(**fields["settings"], compositors=COMPOSITORS)})
     make_ahead(needed(step, torch.device("cpu"))[::-1])
 
 

@@ -5,25 +5,31 @@ whose pixels have all ended leave; light is found first in lists that are cut in
 blocks of all tiles at once (segments.py).
 """
 
+import functools
+import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import torch
 from torch import Tensor
 
+from gsx.core.rasterizer.composite import composite_eager
 from gsx.core.rasterizer.grid import Basis, TileGrid, basis_of, inside_of
 from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
 from gsx.core.rasterizer.precision import Precision
+from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.rasterizer.settings import NOTHING, RasterSettings
 from gsx.core.shapes import Float, Int
+from gsx.engine.backend import COMPILED
 from gsx.engine.compile_cache import recording
-from gsx.engine.compiling import available
+from gsx.engine.compiling import available, complaint
 from gsx.engine.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels, seen_from_front
 from gsx.engine.lanes import LANES, Lanes, centres, from_lanes, lay_out, places_of, to_lanes
-from gsx.engine.path import warn_once
 from gsx.engine.segments import SegmentComposite, cut, parts, segment_job
+
+logger = logging.getLogger(__name__)
 
 MOST_CHANNELS = 8
 """Channels are unrolled: beyond this number compilation takes longer than it saves."""
@@ -286,36 +292,69 @@ class CompiledComposite(torch.autograd.Function):
         return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], absgrad, None, None)
 
 
+class CompiledCompositor:
+    """Blends through compiled loops, or as the eager compositor where only that one can; a `Compositor`."""
+
+    backend = COMPILED
+
+    def __call__(
+        self,
+        screen: ScreenSplats,
+        channels: Float[Tensor, "M C"],
+        intersections: TileIntersections,
+        grid: TileGrid,
+        settings: RasterSettings,
+    ) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
+        if channels.shape[1] > MOST_CHANNELS or screen.weigh or not len(intersections.splats):
+            return composite_eager(screen, channels, intersections, grid, settings)
+        device = screen.means.device.type
+        if not available(device):
+            warn_once(device)
+            return composite_eager(screen, channels, intersections, grid, settings)
+        return composite_compiled(screen, channels, intersections, grid, settings), None
+
+
 def composite_compiled(
-    means: Float[Tensor, "M 2"],
-    conic_factors: Float[Tensor, "M 3"],
-    log_opacities: Float[Tensor, "M"],
+    screen: ScreenSplats,
     channels: Float[Tensor, "M C"],
     intersections: TileIntersections,
     grid: TileGrid,
     settings: RasterSettings,
-    *,
-    absgrad: Float[Tensor, "M 2"] | None = None,
 ) -> Float[Tensor, "C_plus_1 H W"]:
-    """Blends like `composite`, through compiled loops. `absgrad` as there. There must be a pair."""
+    """Blends like `composite`, through compiled loops. There must be a pair."""
+    means, absgrad = screen.means, screen.absgrad
     precision = Precision.of(settings, means.dtype)
     rules = rules_of(settings, channels.shape[1], absgrad is not None, precision.evaluation, means.device.type)
     values = settings.compiled_values or (VALUES if means.device.type == "cpu" else VALUES_OF_A_GPU)
+    inputs = means, screen.conic_factors, screen.log_opacities, channels
     if settings.schedule == "segments" or (settings.schedule == "auto" and means.device.type != "cpu"):
-        table = padded_table(means, conic_factors, log_opacities, channels)
         segments = cut(intersections, len(means), settings.unrolled)
         work = segment_job(segments, grid, rules, precision, values, means.device)
-        return SegmentComposite.apply(table, absgrad, intersections, work)
-    batch = max(2, values // (settings.unrolled * settings.tile_size**2 * LANES))
-    given = means, conic_factors, log_opacities, channels, absgrad
-    learning = torch.is_grad_enabled() and any(value is not None and value.requires_grad for value in given)
+        return SegmentComposite.apply(padded_table(*inputs), absgrad, intersections, work)
+    job = chunk_job(intersections, grid, rules, precision, values, (*inputs, absgrad))
+    return CompiledComposite.apply(*inputs, absgrad, intersections, job)
+
+
+def chunk_job(
+    intersections: TileIntersections,
+    grid: TileGrid,
+    rules: Rules,
+    precision: Precision,
+    values: int,
+    inputs: Sequence[Tensor | None],
+) -> Job:
+    """Lays lists out in lanes; `values`: alphas at once; `inputs`: means first, and what else gets a gradient."""
+    means = inputs[0]
+    assert means is not None
+    batch = max(2, values // (rules.chunk * rules.tile_size**2 * LANES))
+    learning = torch.is_grad_enabled() and any(value is not None and value.requires_grad for value in inputs)
     cut_long = learning and means.device.type == "cpu"  # elsewhere the host would wait for sizes
-    lanes = lay_out(intersections, len(means), settings.unrolled, batch, cut_long=cut_long)
+    lanes = lay_out(intersections, len(means), rules.chunk, batch, cut_long=cut_long)
     exact = means.detach().to(precision.exact)
-    job = Job(
+    return Job(
         lanes=lanes,
         grid=grid,
-        basis=basis_of(settings.tile_size, exact.dtype, exact.device),
+        basis=basis_of(rules.tile_size, exact.dtype, exact.device),
         centre=centres(lanes, grid, exact),
         loops=kernels(rules),
         rules=rules,
@@ -323,24 +362,13 @@ def composite_compiled(
         batch=batch,
         learning=learning,
     )
-    return CompiledComposite.apply(means, conic_factors, log_opacities, channels, absgrad, intersections, job)
 
 
-# -- when? --------------------------------------------------------------------------------------------------------
-
-
-def takes(settings: RasterSettings, channels: int, intersections: int, max_weight: bool, device: str) -> bool:
-    """Whether this picture goes the compiled way: asked for, possible here, and nothing only the eager path does."""
-    if settings.path != "compiled":
-        return False
-    if channels > MOST_CHANNELS or max_weight or intersections == 0:
-        return False
-    if not available(device):
-        warn_once(device)
-        return False
-    return True
-
-
-def path_of(settings: RasterSettings, device: torch.device) -> str:
-    """`compiled` or `eager`: which way pictures of three channels go by these settings, here."""
-    return "compiled" if takes(settings, channels=3, intersections=1, max_weight=False, device=device.type) else "eager"
+@functools.lru_cache
+def warn_once(device: str) -> None:
+    """Logs why the eager compositor draws instead."""
+    logger.warning(
+        "rasterizer.path=compiled: nothing can be compiled here (%s); going on with the eager path, which is several "
+        "times slower. Install a C++ compiler (g++ or clang++), or choose rasterizer=eager",
+        complaint(device),
+    )

@@ -8,15 +8,15 @@ State of a pixel: `light` left (1 at first), `x`, `y` the window's middle and `w
 their lists splat by splat, because each window comes from the one before. Formulas: docs/numerics.md.
 """
 
-import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import torch
 from torch import Tensor
 
+from gsx.core.errors import ConfigError
 from gsx.core.rasterizer.composite import sum_by_splat
 from gsx.core.rasterizer.grid import TileGrid, pixel_centres
 from gsx.core.rasterizer.intersections import TileIntersections
@@ -24,8 +24,6 @@ from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Float, Int
-from gsx.engine.compiling import compile_rows
-from gsx.engine.path import compiles
 
 NARROW = 0.1
 """A window narrower than this many standard deviations sees one alpha, that of its middle (published)."""
@@ -153,12 +151,6 @@ def behind_splat(
     )
 
 
-@functools.lru_cache
-def compiled_step() -> Callable[..., tuple[Tensor, ...]]:
-    """`behind_splat` through torch.compile, for any number of tiles."""
-    return compile_rows(behind_splat)
-
-
 # -- the walk over all tiles ---------------------------------------------------------------------------------------
 
 
@@ -193,7 +185,7 @@ def walk(lists: Lists, tiles: Int[Tensor, "B"]) -> Iterator[Met]:
     """All splats of some tiles, longest list first, front to back, as their windows meet them."""
     grid, settings, like = lists.grid, lists.settings, lists.rows
     lengths, starts = lists.intersections.starts.diff()[tiles], lists.intersections.starts[tiles]
-    step = compiled_step() if compiles(settings, like.device.type) and len(tiles) > 1 else behind_splat
+    step = settings.backend.on(like.device.type).kernel(behind_splat) if len(tiles) > 1 else behind_splat
     x, y, one = (column.expand(len(tiles), -1) for column in pixel_centres(grid.tile, like))
     inside = grid.to_tiles(like.new_ones(1, grid.height, grid.width))[:, 0]
     window: PixelWindow = (inside[tiles], x, y, one, one)
@@ -210,7 +202,7 @@ def walk(lists: Lists, tiles: Int[Tensor, "B"]) -> Iterator[Met]:
         row = torch.cat([row[:, :2] - grid.centres(tiles, like), row[:, 2:]], 1)
         alpha, *behind = step(*window, row, *rules)
         yield Met(tiles, starts + number, splats, row, window, alpha)
-        window = tuple(behind)  # type: ignore[assignment]
+        window = tuple(behind)
 
 
 def batches(lists: Lists) -> Iterator[Int[Tensor, "B"]]:
@@ -340,24 +332,23 @@ class WindowComposite(torch.autograd.Function):
 
 def composite_windows(
     screen: ScreenSplats,
-    means: Float[Tensor, "M 2"],
     channels: Float[Tensor, "M C"],
     intersections: TileIntersections,
     grid: TileGrid,
     settings: RasterSettings,
-    *,
-    absgrad: Float[Tensor, "M 2"] | None = None,
-    max_weight: bool = False,
 ) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
-    """Blended channels, then coverage, as `composite` has them; and largest weights where they are asked for.
+    """Blends by pixel windows; a `Compositor`.
 
     The gradient is the published one: that a splat moves the windows of those behind it is left out, which the paper's
     training does as well.
     """
+    if settings.pixel != "window":
+        raise ConfigError("rasterizer.path=window draws pixel windows: give rasterizer.pixel=window instead")
+    means, factors = screen.means, screen.conic_factors.detach()
     exact = Precision.of(settings, means.dtype).exact
-    most = means.new_zeros(len(intersections.splats), dtype=exact) if max_weight else None
-    given = means, screen.covariances, screen.log_opacities, channels, absgrad, screen.conic_factors.detach()
-    in_format = [None if values is None else values.to(exact) for values in given]
+    most = means.new_zeros(len(intersections.splats), dtype=exact) if screen.weigh else None
+    inputs = means, screen.covariances, screen.log_opacities, channels, screen.absgrad, factors
+    in_format = [None if values is None else values.to(exact) for values in inputs]
     blended = WindowComposite.apply(*in_format, intersections, grid, settings, most).to(means.dtype)
     if most is None:
         return blended, None

@@ -1,13 +1,11 @@
-"""Spherical harmonics of directions, compiled or not, with the signs of 3D-GS (3D-GS, sh_utils.py)."""
+"""Kernels of spherical harmonics, with the signs of 3D-GS (3D-GS, sh_utils.py)."""
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from gsx.core.shapes import Float
-from gsx.engine.compiling import IN_VECTORS, WHOLE_LOOPS, compile_rows
 
 BAND_0 = 0.28209479177387814
 BAND_1 = 0.4886025119029199
@@ -37,12 +35,6 @@ def harmonics_along(offsets: Float[Tensor, "N 3"], degree: int) -> Float[Tensor,
     return torch.stack(bands(x * shrink, y * shrink, z * shrink, degree))
 
 
-@functools.lru_cache
-def compiled_harmonics(degree: int) -> Callable[..., Tensor]:
-    """`harmonics_along` and its backward through torch.compile, for any number of offsets."""
-    return compile_rows(harmonics_along, degree, options=IN_VECTORS)
-
-
 def contraction(rest: Float[Tensor, "N B 3"], basis: Float[Tensor, "B N"]) -> Float[Tensor, "N 3"]:
     """sum over b of basis[b, n] rest[n, b, c], in one loop over splats once it is compiled."""
     coefficients = rest.flatten(1).unbind(1)
@@ -65,12 +57,3 @@ def contraction_slopes(
     by_rest = torch.stack([band * channel for band in basis for channel in channels], 1)
     by_basis = [sum_of_products(channels, coefficients[3 * band : 3 * band + 3]) for band in range(len(basis))]
     return by_rest.view(rest.shape), torch.stack(by_basis)
-
-
-@functools.lru_cache
-def compiled_contraction(count: int) -> tuple[Callable[..., Tensor], Callable[..., tuple[Tensor, Tensor]]]:
-    """`contraction` and `contraction_slopes` of so many bands through torch.compile, for any number of splats."""
-    return (
-        compile_rows(contraction, options=WHOLE_LOOPS),
-        compile_rows(contraction_slopes, options=WHOLE_LOOPS),
-    )

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsx.core.gaussians.bands import BAND_0, bands, compiled_contraction, compiled_harmonics, harmonics_along
+from gsx.core.backend import EAGER, Backend
+from gsx.core.gaussians.bands import BAND_0, bands, contraction, contraction_slopes, harmonics_along
 from gsx.core.shapes import Float
 
 
@@ -25,17 +26,18 @@ class Contraction(torch.autograd.Function):
     """sum over b of basis[b, n] rest[n, b, c]."""
 
     @staticmethod
-    def forward(ctx, basis, rest, compiled):
+    def forward(ctx, basis, rest, backend):
         ctx.save_for_backward(basis, rest)
-        ctx.compiled = compiled
-        contract = compiled_contraction(len(basis))[0] if compiled else spread_contraction
+        ctx.backend = backend
+        contract = backend.kernel(contraction, variant=(len(basis),)) if backend.compiled else spread_contraction
         return contract(rest[:], basis)  # a view, or torch would compile once more where others are none
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradient):
         basis, rest = ctx.saved_tensors
-        slopes_of = compiled_contraction(len(basis))[1] if ctx.compiled else spread_slopes
+        compiled = ctx.backend.compiled
+        slopes_of = ctx.backend.kernel(contraction_slopes, variant=(len(basis),)) if compiled else spread_slopes
         by_rest, by_basis = slopes_of(gradient.contiguous(), rest[:], basis)
         return by_basis, by_rest, None
 
@@ -72,20 +74,20 @@ def colours_of(
     rest: Float[Tensor, "N B 3"],
     offsets: Float[Tensor, "N 3"],
     degree: int,
-    compiled: bool = False,
+    backend: Backend = EAGER,
 ) -> Float[Tensor, "N 3"]:
     """max(0, 0.5 + SH): colours seen along `offsets` (splat minus camera centre, any length) up to `degree`."""
     colours = colour_of_constant(constant[:, 0])
     if degree == 0:
         return colours.clamp_min(0)
     count = (degree + 1) ** 2 - 1
-    if not compiled or len(offsets) < 2:
+    if not backend.compiled or len(offsets) < 2:
         basis = harmonics_along(offsets, degree).to(rest)
-        return (colours + Contraction.apply(basis, rest[:, :count], False)).clamp_min(0)
-    basis = compiled_harmonics(degree_of(rest.shape[1]))(offsets).to(rest)  # of all bands: compiled once
+        return (colours + Contraction.apply(basis, rest[:, :count], EAGER)).clamp_min(0)
+    basis = backend.kernel(harmonics_along, degree_of(rest.shape[1]))(offsets).to(rest)  # of all bands: compiled once
     if count < len(basis):
         basis = torch.cat([basis[:count], torch.zeros_like(basis[count:])])
-    return (colours + Contraction.apply(basis, rest, True)).clamp_min(0)
+    return (colours + Contraction.apply(basis, rest, backend)).clamp_min(0)
 
 
 def constant_from_colour(colour: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:

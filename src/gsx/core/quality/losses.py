@@ -1,47 +1,40 @@
 """The photometric loss: 0.8 L1 + 0.2 (1 - SSIM) with the zero-padded SSIM of 3D-GS (3D-GS, loss_utils.py)."""
 
-import functools
-from collections.abc import Callable
-from functools import partial
-
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
+from gsx.core.backend import EAGER, Backend
 from gsx.core.quality.similarity import (
     WINDOW,
-    compiled_correlate,
-    compiled_loss_slopes,
-    compiled_slopes,
     correlate,
     loss_slopes,
     similarity,
     ssim_slopes,
 )
 from gsx.core.shapes import Float
-from gsx.engine.compiling import compiled_once, with_last
 
 PADDING = WINDOW // 2
 """With so many zeros around it the blurred picture has its size."""
 
 
-def blur(maps: Float[Tensor, "M H W"], padding: int, compiled: bool = False) -> Float[Tensor, "M h w"]:
+def blur(maps: Float[Tensor, "M H W"], padding: int, backend: Backend = EAGER) -> Float[Tensor, "M h w"]:
     """Separable Gaussian window over each map, zero-padded by `padding`."""
-    if compiled:
-        return compiled_correlate(1)(compiled_correlate(2)(pad(maps, (padding,) * 4)))
+    if backend.compiled:
+        return backend.kernel(correlate, 1)(backend.kernel(correlate, 2)(pad(maps, (padding,) * 4)))
     rows = correlate(pad(maps, (padding, padding)), 2)
     return correlate(pad(rows, (0, 0, padding, padding)), 1)
 
 
 def ssim_map(
-    image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], padding: int = PADDING, compiled: bool = False
+    image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], padding: int = PADDING, backend: Backend = EAGER
 ) -> Float[Tensor, "C h w"]:
     """Structural similarity per channel and pixel; biased variances.
 
     `padding` is 5 for INRIA's zero-padded windows, 0 for whole windows only.
     """
-    luminance, structure, *_ = similarity(*blurred(image, target, padding, compiled))
+    luminance, structure, *_ = similarity(*blurred(image, target, padding, backend))
     return luminance * structure
 
 
@@ -49,20 +42,20 @@ def blurred(
     image: Float[Tensor, "C H W"],
     target: Float[Tensor, "C H W"],
     padding: int,
-    compiled: bool = False,
+    backend: Backend = EAGER,
     target_moments: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, ...]:
     """Blurred image, target, image^2, target^2 and image target, each [C h w]; target_moments: `moments_of` it."""
-    x, xx, xy = (blur(each, padding, compiled) for each in (image, image * image, image * target))
-    y, yy = moments_of(target, padding, compiled) if target_moments is None else target_moments
+    x, xx, xy = (blur(each, padding, backend) for each in (image, image * image, image * target))
+    y, yy = moments_of(target, padding, backend) if target_moments is None else target_moments
     return x, y, xx, yy, xy
 
 
 def moments_of(
-    target: Float[Tensor, "C H W"], padding: int = PADDING, compiled: bool = False
+    target: Float[Tensor, "C H W"], padding: int = PADDING, backend: Backend = EAGER
 ) -> tuple[Float[Tensor, "C h w"], Float[Tensor, "C h w"]]:
     """Blurred target and target^2: what SSIM takes of a target alone."""
-    return blur(target, padding, compiled), blur(target * target, padding, compiled)
+    return blur(target, padding, backend), blur(target * target, padding, backend)
 
 
 def volume_loss(scales: Float[Tensor, "N 3"], weight: float) -> Float[Tensor, ""]:
@@ -75,40 +68,29 @@ def photometric_and_gradient(
     image: Float[Tensor, "C H W"],
     target: Float[Tensor, "C H W"],
     ssim_weight: float,
-    compiled: bool,
+    backend: Backend = EAGER,
     target_moments: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "C H W"]]:
     """The photometric loss and its gradient by the image. The blur is its own adjoint: the window is symmetric and the
     padding zero."""
-    parts = blurred(image, target, PADDING, compiled, target_moments)
-    slopes_of = compiled_slopes() if compiled else ssim_slopes
-    ssim, *slopes = slopes_of(*(part.flatten() for part in parts))
-    back = [blur(slope.view(image.shape), PADDING, compiled).flatten() for slope in slopes]
-    combine = compiled_loss_slopes(ssim_weight) if compiled else partial(loss_slopes, ssim_weight=ssim_weight)
+    parts = blurred(image, target, PADDING, backend, target_moments)
+    ssim, *slopes = backend.kernel(ssim_slopes)(*(part.flatten() for part in parts))
+    back = [blur(slope.view(image.shape), PADDING, backend).flatten() for slope in slopes]
+    combine = backend.kernel(loss_slopes, ssim_weight)
     value, slope = combine(image.flatten(), target.flatten(), ssim, *back)
     return value.mean(), slope.view(image.shape) / image.numel()
-
-
-@functools.lru_cache
-def compiled_photometric(ssim_weight: float) -> Callable[..., tuple[Tensor, Tensor]]:
-    """`photometric_and_gradient` through torch.compile, for pictures of any size."""
-
-    def varying(arguments: tuple[Tensor, ...]) -> list[tuple[Tensor, int]]:
-        return [(picture, axis) for picture in arguments for axis in (1, 2)]
-
-    return compiled_once(with_last(photometric_and_gradient, ssim_weight, False, None), varying)
 
 
 class Photometric(torch.autograd.Function):
     """The loss, with its gradient found on the way forward."""
 
     @staticmethod
-    def forward(ctx, image, target, ssim_weight, compiled, target_moments):
+    def forward(ctx, image, target, ssim_weight, backend, target_moments):
         image, target = image.detach(), target.detach()
-        if compiled and image.device.type != "cpu":  # launches cost: all of it at once
-            loss, gradient = compiled_photometric(ssim_weight)(image, target)
+        if backend.compiled and image.device.type != "cpu":  # launches cost: all of it at once
+            loss, gradient = backend.kernel(photometric_and_gradient, ssim_weight, EAGER, None)(image, target)
         else:
-            loss, gradient = photometric_and_gradient(image, target, ssim_weight, compiled, target_moments)
+            loss, gradient = photometric_and_gradient(image, target, ssim_weight, backend, target_moments)
         ctx.save_for_backward(gradient)
         return loss
 
@@ -123,11 +105,13 @@ def photometric(
     image: Float[Tensor, "C H W"],
     target: Float[Tensor, "C H W"],
     ssim_weight: float,
-    compiled: bool = False,
+    backend: Backend = EAGER,
     target_moments: tuple[Tensor, Tensor] | None = None,
 ) -> Float[Tensor, ""]:
     """(1 - w) mean |I - G| + w (1 - SSIM), a mean over pixels and channels; differentiable once, in the image.
 
-    target_moments: `moments_of` it, where they are known. Compiled code of a GPU finds them anew: all is one launch.
+    Args:
+        backend: `RasterSettings.backend.on(device, learning=True)`.
+        target_moments: `moments_of` the target, where they are known. Compiled code of a GPU needs none.
     """
-    return Photometric.apply(image, target, ssim_weight, compiled, target_moments)
+    return Photometric.apply(image, target, ssim_weight, backend, target_moments)

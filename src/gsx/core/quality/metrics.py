@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from gsx.core.backend import EAGER, Backend
 from gsx.core.quality.losses import ssim_map
 from gsx.core.quality.similarity import WINDOW
 from gsx.core.shapes import Bool, Float
@@ -39,23 +40,23 @@ def ssim(
     target: Float[Tensor, "C H W"],
     variant: str,
     counted: Bool[Tensor, "H W"] | None = None,
-    compiled: bool = False,
+    backend: Backend = EAGER,
 ) -> float:
     """Structural similarity in [-1, 1], a mean over windows around pixels that count (None: all); nan where none does.
 
     They differ near borders. `inria`: zero-padded windows, mean over the whole map, as in the 3D-GS release.
     `torchmetrics`: the same with reflected borders (repeated, where too narrow), as torchmetrics since 1.5. `valid`:
-    mean over the pixels whose window lies inside, as the original SSIM and pytorch-msssim. `compiled`: by such loops.
+    mean over the pixels whose window lies inside, as the original SSIM and pytorch-msssim. `backend`: of the loops.
     """
     if variant == "inria":
-        return whole_windows(pad(image, (WINDOW // 2,) * 4), pad(target, (WINDOW // 2,) * 4), counted, compiled)
+        return whole_windows(pad(image, (WINDOW // 2,) * 4), pad(target, (WINDOW // 2,) * 4), counted, backend)
     if variant == "torchmetrics":
         half, mode = WINDOW // 2, "reflect" if min(image.shape[1:]) > WINDOW // 2 else "replicate"
         padded_image, padded_target = (pad(picture, (half,) * 4, mode=mode) for picture in (image, target))
-        return whole_windows(padded_image, padded_target, counted, compiled)
+        return whole_windows(padded_image, padded_target, counted, backend)
     if variant == "valid":
         inner = slice(WINDOW // 2, -(WINDOW // 2))
-        return whole_windows(image, target, None if counted is None else counted[inner, inner], compiled)
+        return whole_windows(image, target, None if counted is None else counted[inner, inner], backend)
     raise ValueError(f"SSIM variant '{variant}' is unknown; choose from {', '.join(SSIM_VARIANTS)}")
 
 
@@ -63,7 +64,7 @@ def whole_windows(
     image: Float[Tensor, "C H W"],
     target: Float[Tensor, "C H W"],
     counted: Bool[Tensor, "h w"] | None,
-    compiled: bool,
+    backend: Backend,
 ) -> float:
     """Mean SSIM where the window fits, its middle counts; pictures smaller than a window are extended by their border
     first, and then count everywhere.
@@ -82,7 +83,7 @@ def whole_windows(
     weights, total = weights.to(image.device).double(), 0.0
     for top in range(0, count, rows):
         strip = slice(top, min(top + rows, count) + WINDOW - 1)
-        found = ssim_map(image[:, strip], target[:, strip], padding=0, compiled=compiled)
+        found = ssim_map(image[:, strip], target[:, strip], padding=0, backend=backend)
         total += float((found * weights[top : top + rows]).sum())
     return total / (len(image) * float(weights.sum()))
 

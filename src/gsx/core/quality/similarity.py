@@ -1,14 +1,10 @@
-"""The parts of SSIM and of the photometric loss that are compiled: its window along an axis, and what is computed pixel
-by pixel (Wang et al. 2004)."""
+"""Kernels of SSIM and of the photometric loss: its window along an axis, and pixel by pixel (Wang et al. 2004)."""
 
-import functools
 import math
-from collections.abc import Callable
 
 from torch import Tensor
 
 from gsx.core.shapes import Float
-from gsx.engine.compiling import compile_rows, compiled_once, with_last
 
 WINDOW, SIGMA = 11, 1.5
 """SSIM window edge and standard deviation, px (Wang et al. 2004; 3D-GS, loss_utils.py)."""
@@ -30,16 +26,6 @@ def correlate(maps: Float[Tensor, "M H W"], axis: int) -> Float[Tensor, "M h w"]
     return total
 
 
-@functools.lru_cache
-def compiled_correlate(axis: int) -> Callable[[Tensor], Tensor]:
-    """`correlate` along an axis through torch.compile, for maps of any size."""
-
-    def varying(arguments: tuple[Tensor, ...]) -> list[tuple[Tensor, int]]:
-        return [(maps, side) for maps in arguments for side in (1, 2)]
-
-    return compiled_once(with_last(correlate, axis), varying)
-
-
 def similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """SSIM's two factors, of means and of spreads, and their denominators, from what `blurred` returns."""
     means, spreads = x**2 + y**2 + C1, xx - x**2 + yy - y**2 + C2
@@ -55,12 +41,6 @@ def ssim_slopes(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> tup
     return ssim, by_x, by_xx, by_xy
 
 
-@functools.lru_cache
-def compiled_slopes() -> Callable[..., tuple[Tensor, ...]]:
-    """`ssim_slopes` through torch.compile, for any number of pixels."""
-    return compile_rows(ssim_slopes)
-
-
 def loss_slopes(
     image: Tensor, target: Tensor, ssim: Tensor, by_x: Tensor, by_xx: Tensor, by_xy: Tensor, ssim_weight: float
 ) -> tuple[Tensor, Tensor]:
@@ -69,9 +49,3 @@ def loss_slopes(
     difference, by_ssim = image - target, by_x + 2 * image * by_xx + target * by_xy
     value = (1 - ssim_weight) * difference.abs() + ssim_weight * (1 - ssim)
     return value, (1 - ssim_weight) * difference.sign() - ssim_weight * by_ssim
-
-
-@functools.lru_cache
-def compiled_loss_slopes(ssim_weight: float) -> Callable[..., tuple[Tensor, Tensor]]:
-    """`loss_slopes` through torch.compile, for any number of pixels."""
-    return compile_rows(loss_slopes, ssim_weight)

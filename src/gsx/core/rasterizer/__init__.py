@@ -4,19 +4,18 @@ import torch
 
 from gsx.core.rasterizer.projection import drawable, repeat_rows, take_rows
 from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
-from gsx.core.rasterizer.settings import RasterSettings
+from gsx.core.rasterizer.settings import RasterOptions, RasterSettings
 from gsx.core.rasterizer.tiled import TILE_PIXELS, TiledRendering, rasterize_tiled
 from gsx.core.rasterizer.visibility import touches, undilated_radii
-from gsx.engine.path import goes_compiled
 
 __all__ = [
     "TILE_PIXELS",
+    "RasterOptions",
     "RasterSettings",
     "Rendering",
     "ScreenStatistics",
     "TiledRendering",
     "drawable",
-    "goes_compiled",
     "rasterize",
     "rasterize_tiled",
     "repeat_rows",

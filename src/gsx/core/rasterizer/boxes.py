@@ -1,18 +1,15 @@
-"""Tiles that splats may reach, splat by splat and row of tiles by row, compiled or not. Nothing here is differentiated.
+"""Tiles that splats may reach, splat by splat and row of tiles by row. Nothing here is differentiated.
 
 Numbers of one splat lie in columns (see geometry.py); a box is (first, past the last) tile along an axis.
 """
 
-import functools
 import math
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from gsx.core.rasterizer.settings import CUTOFF_SLACK, WINDOW_TILE
 from gsx.core.shapes import Float, Int
-from gsx.engine.compiling import IN_VECTORS, OWN_INDICES, ROWS_ALIKE, compile_rows, compiled_once, with_last
 
 FAR = 1 << 20
 """Pixels and tiles farther out than any raster; keeps integers in range."""
@@ -142,19 +139,3 @@ def spans(
     begin, end = row_spans(mean_x, mean_y, (u0, u1, u2), limit, row, tile, reach)
     begin, end = begin.maximum(left), end.minimum(right)
     return row, begin, (end - begin).clamp_min(0)
-
-
-@functools.lru_cache
-def compiled_boxes(alpha_min: float, tile: int, reach: float, windowed: bool) -> Callable[..., tuple[Tensor, ...]]:
-    """`boxes` of these rules through torch.compile, for any number of splats and any raster."""
-    return compile_rows(boxes, alpha_min, tile, reach, windowed, options=IN_VECTORS)
-
-
-@functools.lru_cache
-def compiled_spans(tile: int, reach: float) -> Callable[..., tuple[Tensor, ...]]:
-    """`spans` of these rules through torch.compile, for any number of splats and rows."""
-
-    def varying(arguments: tuple[Tensor, ...]) -> list[tuple[Tensor, int]]:
-        return [(tensor, 0) for tensor in arguments]
-
-    return compiled_once(with_last(spans, tile, reach), varying, OWN_INDICES | ROWS_ALIKE)

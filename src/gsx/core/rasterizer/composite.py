@@ -26,6 +26,7 @@ from gsx.core.rasterizer.exponent import (
 from gsx.core.rasterizer.grid import TileGrid, pixel_centres
 from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.rasterizer.precision import Precision
+from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.rasterizer.settings import NOTHING, RasterSettings
 from gsx.core.shapes import Float, Int
 
@@ -324,3 +325,21 @@ def composite(
     mean (px). `max_weights` receives the largest blending weight of each list entry.
     """
     return Composite.apply(means, conic_factors, log_opacities, channels, absgrad, blocks, grid, settings, max_weights)
+
+
+def composite_eager(
+    screen: ScreenSplats,
+    channels: Float[Tensor, "M C"],
+    intersections: TileIntersections,
+    grid: TileGrid,
+    settings: RasterSettings,
+) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
+    """Blends by eager torch; a `Compositor`."""
+    blocks = make_blocks(intersections, settings.chunk, len(screen.ids))
+    by_entry = screen.means.new_zeros(blocks.splats.shape) if screen.weigh else None
+    inputs = (screen.means, screen.conic_factors, screen.log_opacities, channels)
+    blended = composite(*inputs, blocks, grid, settings, absgrad=screen.absgrad, max_weights=by_entry)
+    if by_entry is None:
+        return blended, None
+    zeros = by_entry.new_zeros(len(screen.ids) + 1)
+    return blended, zeros.scatter_reduce_(0, blocks.splats.view(-1), by_entry.view(-1), "amax")[:-1]

@@ -11,18 +11,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsx.core.backend import EAGER
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.device import uploaded
 from gsx.core.errors import TooManyPairs
 from gsx.core.rasterizer.bags import bag_sums, edges_of
-from gsx.core.rasterizer.boxes import boxes, compiled_boxes, compiled_spans, spans
+from gsx.core.rasterizer.boxes import boxes, spans
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
 from gsx.core.rasterizer.sorting import sorted_stably
 from gsx.core.shapes import Float, Int
-from gsx.engine.compiling import fused
-from gsx.engine.path import compiles
 
 WINDOW_REACH = 1.25
 """Px from its centre within which all light of a pixel lies where windows are kept: half a diagonal, and as much as a
@@ -94,8 +93,8 @@ def boxes_of(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> 
     )
     numbers = raster_numbers(camera, settings, screen.means.device)
     given = screen.means.detach(), screen.covariances.detach(), screen.log_opacities.detach(), numbers
-    compiled = len(screen.ids) > 1 and compiles(settings, screen.means.device.type)
-    *edges, radii, limits = compiled_boxes(*rules)(*given) if compiled else boxes(*given, *rules)
+    backend = settings.backend.on(screen.means.device.type) if len(screen.ids) > 1 else EAGER
+    *edges, radii, limits = backend.kernel(boxes, *rules)(*given)
     return Boxes(first=torch.stack(edges[:2]), last=torch.stack(edges[2:]), radii=radii, limits=limits)
 
 
@@ -111,18 +110,18 @@ def intersect_tiles(screen: ScreenSplats, camera: Camera, settings: RasterSettin
     bits = screen.depths.contiguous().view({4: torch.int32, 8: torch.int64}[screen.depths.element_size()])
     order = sorted_stably(bits)[1]
     shapes = screen.means.detach(), screen.conic_factors.detach(), found.limits
-    heights, placed, sides = in_order(order, found.first, found.last, *shapes)
+    backend = settings.backend.on(order.device.type)
+    heights, placed, sides = backend.kernel(in_order)(order, found.first, found.last, *shapes)
     starts = heights.cumsum(0) - heights  # apart: compiled, a long running sum is one of a single group of threads
     rank = torch.repeat_interleave(heights, output_size=refuse_too_many(heights, grid, settings))
-    given = rank, placed, sides, starts
-    compiled = min(len(rank), len(order)) > 1 and compiles(settings, rank.device.type)
-    rules = grid.tile, reach_of(settings)
-    row, begin, widths = compiled_spans(*rules)(*given) if compiled else spans(*given, *rules)
+    find_spans = (backend if min(len(rank), len(order)) > 1 else EAGER).kernel(spans, grid.tile, reach_of(settings))
+    row, begin, widths = find_spans(rank, placed, sides, starts)
     line = torch.repeat_interleave(widths, output_size=refuse_too_many(widths, grid, settings))
-    return sorted_pairs(order, rank, row - grid.first[1], begin - grid.first[0], widths, line, grid, found.radii)
+    row, begin = row - grid.first[1], begin - grid.first[0]
+    tiles = backend.kernel(pair_tiles)(line, row, begin, widths.cumsum(0, dtype=torch.int32) - widths, grid.shape[0])
+    return sorted_pairs(order, rank, widths, line, tiles, grid, found.radii)
 
 
-@fused
 def in_order(
     order: Int[Tensor, "M"],
     first: Int[Tensor, "2 M"],
@@ -139,7 +138,6 @@ def in_order(
     return heights.index_select(0, order), shapes.index_select(0, order), sides.index_select(0, order)
 
 
-@fused
 def pair_tiles(
     line: Int[Tensor, "P"], row: Int[Tensor, "R"], begin: Int[Tensor, "R"], before: Int[Tensor, "R"], columns: int
 ) -> Int[Tensor, "P"]:
@@ -152,20 +150,16 @@ def pair_tiles(
 def sorted_pairs(
     order: Int[Tensor, "M"],
     rank: Int[Tensor, "R"],
-    row: Int[Tensor, "R"],
-    begin: Int[Tensor, "R"],
     widths: Int[Tensor, "R"],
     line: Int[Tensor, "P"],
+    tiles: Int[Tensor, "P"],
     grid: TileGrid,
     radii: Int[Tensor, "M"],
 ) -> TileIntersections:
-    """Expand spans of `widths` tiles from column `begin` of a tile row into intersections, and sort them by tile.
-
-    `rank` names the splat of each span, `line` the span of each intersection.
-    """
+    """Sorts intersections by tile; `rank` names the splat of each span of `widths` tiles, `line` the span of each
+    intersection, `tiles` its tile."""
     columns, rows = grid.shape
     narrow = torch.int16 if columns * rows <= torch.iinfo(torch.int16).max else torch.int32  # sorted fastest
-    tiles = pair_tiles(line, row, begin, widths.cumsum(0, dtype=torch.int32) - widths, columns)
     tiles, slots = sorted_stably(tiles.to(narrow))
     splats = order.int().index_select(0, rank).index_select(0, line).index_select(0, slots)
     counts = widths.new_zeros(len(order)).index_add_(0, rank, widths)

@@ -1,14 +1,13 @@
 """World Gaussians to screen Gaussians, stable by construction (docs/numerics.md; 3D-GS sections 3.1 and 3.2)."""
 
-import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from gsx.core.backend import EAGER
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.device import uploaded
 from gsx.core.errors import InputError
@@ -18,13 +17,9 @@ from gsx.core.rasterizer.geometry import geometry
 from gsx.core.rasterizer.selection import chosen_rows, lens_of, selected, slope_bounds
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
-from gsx.engine.compiling import IN_VECTORS, compile_rows
-from gsx.engine.path import compiles, goes_compiled
 
 FOCAL_LIMIT = 1e12
 """No camera has a focal length of so many px, or sees so many focal lengths off its axis."""
-Geometry: TypeAlias = Callable[..., tuple[Tensor, Tensor, Tensor, Tensor | None]]
-"""`geometry`, compiled or not."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,6 +38,10 @@ class ScreenSplats:
     log_opacities: Float[Tensor, "M"]
     """Compensated for dilation where the settings ask for it."""
     channels: Float[Tensor, "M C"]
+    absgrad: Float[Tensor, "M 2"] | None = None
+    """Zeros whose gradient becomes, per axis, the sum over pixels of the absolute gradient of the mean, px."""
+    weigh: bool = False
+    """Whether the compositor is to return the largest blending weight of every splat."""
     dropped: int
     """Splats left out because a value or a projection of theirs is not finite, or its square is not."""
 
@@ -85,7 +84,7 @@ def drawable(splats: Splats, camera: Camera, settings: RasterSettings) -> Bool[T
     """False for the splats that a render from this camera leaves out and counts as dropped."""
     numbers = lens_of(camera, on_frame(intrinsics_of(camera, None), camera.frame), settings.dilation, settings)
     numbers = numbers.to(splats.means.device)
-    return selected(splats, camera.to_camera(splats.means), numbers, compiled=False)[0]
+    return selected(splats, camera.to_camera(splats.means), numbers, EAGER)[0]
 
 
 def project(
@@ -104,8 +103,8 @@ def project(
     lens = lens_of(camera, on_frame(own, camera.frame), dilation, settings)
     numbers = uploaded(lens, splats.means.device)
     points = camera.to_camera(splats.means)
-    compiled = len(splats) > 1 and compiles(settings, splats.means.device.type)
-    good, shown = selected(splats, points, numbers, compiled)
+    device = splats.means.device.type
+    good, shown = selected(splats, points, numbers, settings.backend.on(device) if len(splats) > 1 else EAGER)
     fields = (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
     ids, dropped = chosen_rows(good, shown)  # before any division
     points, scales, quats, log_opacities, channels = (take_rows(values, ids) for values in fields)
@@ -114,9 +113,8 @@ def project(
     # torch, a float64 tensor of no dimension
     rules = scales.new_full((1,), dilation), compensate, scales.new_full((1,), drawn) if drawn else None
     shape = numbers[:4], numbers[4:6].to(scales), numbers[6:8].to(scales)
-    compute = geometry
-    if len(ids) > 1 and goes_compiled(settings, ids.device.type):
-        compute = compiled_geometry(compensate, bool(drawn))
+    backend = settings.backend.on(device, learning=True) if len(ids) > 1 else EAGER
+    compute = backend.kernel(geometry, variant=(compensate, bool(drawn)))
     means, covariances, conic_factors, compensation = compute(
         points, scales, quats, uploaded(camera.rotation, ids.device, scales.dtype), *shape, *rules
     )
@@ -184,9 +182,3 @@ class RepeatRows(torch.autograd.Function):
 def repeat_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[Tensor, "M *rest"]:
     """`values[ids]` for ids that ascend, with repetitions."""
     return RepeatRows.apply(values, ids)
-
-
-@functools.lru_cache
-def compiled_geometry(compensate: bool, exchange: bool) -> Geometry:
-    """`geometry` and its backward through torch.compile, for any number of splats; each rule compiles for itself."""
-    return compile_rows(geometry, options=IN_VECTORS)

@@ -8,14 +8,12 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.cap import capped
-from gsx.core.rasterizer.composite import composite, make_blocks
+from gsx.core.rasterizer.composite import composite_eager
 from gsx.core.rasterizer.grid import TileGrid
-from gsx.core.rasterizer.intersections import TileIntersections, intersect_tiles
+from gsx.core.rasterizer.intersections import intersect_tiles
 from gsx.core.rasterizer.projection import ScreenSplats, project
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
-from gsx.engine.compiled import composite_compiled, takes
-from gsx.engine.pixel_windows import composite_windows
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,35 +76,6 @@ class Rendering:
     """Splats left out because a value of theirs is not finite."""
 
 
-def blend(
-    screen: ScreenSplats,
-    told: ScreenStatistics,
-    channels: Float[Tensor, "M C"],
-    intersections: TileIntersections,
-    camera: Camera,
-    settings: RasterSettings,
-    max_weight: bool,
-) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
-    """Channels and coverage by the path that the settings ask for, and largest weights where they are asked for; `told`
-    gathers gradients."""
-    absgrad = told.absgrad
-    inputs = (screen.means + told.means2d_offset, screen.conic_factors, screen.log_opacities, channels)
-    grid = TileGrid.of(camera, settings.tile_size)
-    if settings.pixel == "window":
-        return composite_windows(
-            screen, inputs[0], channels, intersections, grid, settings, absgrad=absgrad, max_weight=max_weight
-        )
-    if takes(settings, channels.shape[1], len(intersections.splats), max_weight, screen.means.device.type):
-        return composite_compiled(*inputs, intersections, grid, settings, absgrad=absgrad), None
-    blocks = make_blocks(intersections, settings.chunk, len(screen.ids))
-    by_entry = screen.means.new_zeros(blocks.splats.shape) if max_weight else None
-    blended = composite(*inputs, blocks, grid, settings, absgrad=absgrad, max_weights=by_entry)
-    if by_entry is None:
-        return blended, None
-    zeros = by_entry.new_zeros(len(screen.ids) + 1)
-    return blended, zeros.scatter_reduce_(0, blocks.splats.view(-1), by_entry.view(-1), "amax")[:-1]
-
-
 def rasterize(
     splats: Splats,
     camera: Camera,
@@ -130,9 +99,14 @@ def rasterize(
     screen = project(splats, camera, settings, intrinsics)
     intersections = capped(intersect_tiles(screen, camera, settings), settings.tile_cap)
     learning = torch.is_grad_enabled() and any(value.requires_grad for value in vars(splats).values())
-    told = ScreenStatistics.before_blending(screen, intersections.radii, camera.size, learning, absolute_gradient)
+    statistics = ScreenStatistics.before_blending(screen, intersections.radii, camera.size, learning, absolute_gradient)
     channels = torch.cat([screen.channels, screen.depths[:, None]], 1) if depth else screen.channels
-    blended, max_weights = blend(screen, told, channels, intersections, camera, settings, max_weight)
+    screen = replace(
+        screen, means=screen.means + statistics.means2d_offset, absgrad=statistics.absgrad, weigh=max_weight
+    )
+    composite = settings.compositors.get(settings.compositor_name, composite_eager)
+    grid = TileGrid.of(camera, settings.tile_size)
+    blended, max_weights = composite(screen, channels, intersections, grid, settings)
     count = splats.colours.shape[1]
     image, alpha = blended[:count], blended[-1]
     if background is not None:
@@ -143,5 +117,5 @@ def rasterize(
         depth=blended[count] if depth else None,
         intersections=len(intersections.splats),
         dropped=screen.dropped,
-        screen=replace(told, max_weights=max_weights),
+        screen=replace(statistics, max_weights=max_weights),
     )

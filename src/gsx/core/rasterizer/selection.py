@@ -3,17 +3,16 @@
 import functools
 import math
 import operator
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from gsx.core.backend import Backend
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.settings import CUTOFF_SLACK, WINDOW_TILE, RasterSettings
 from gsx.core.shapes import Bool, Float, Int
-from gsx.engine.compiling import compile_rows
 
 OPACITY_SLACK = 1e-3
 """ln of an opacity may exceed 0 by this, for rounding."""
@@ -134,22 +133,15 @@ def select(
     return good, good & in_front & near_raster(points, largest_scales, lens)
 
 
-@functools.lru_cache
-def compiled_select() -> Callable[..., tuple[Tensor, Tensor]]:
-    """`select` through torch.compile, for any number of splats."""
-    return compile_rows(select)
-
-
 @torch.no_grad()
 def selected(
-    splats: Splats, points: Float[Tensor, "N 3"], numbers: Float[Tensor, "16"], compiled: bool
+    splats: Splats, points: Float[Tensor, "N 3"], numbers: Float[Tensor, "16"], backend: Backend
 ) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
-    """What `select` says of splats. The same code serves those without colours, and fields with gaps."""
+    """Calls `select` on splats. The same code serves those without colours, and fields with gaps."""
     colours = splats.colours if splats.colours.shape[1] else splats.means
     fields = (points, splats.means, splats.scales, splats.quats, splats.log_opacities, colours)
     points, means, scales, quats, log_opacities, colours = (value.detach().contiguous() for value in fields)
-    choose = compiled_select() if compiled else select
-    return choose(points, means, scales, quats, log_opacities, colours, numbers.detach())
+    return backend.kernel(select)(points, means, scales, quats, log_opacities, colours, numbers.detach())
 
 
 def chosen_rows(good: Bool[Tensor, "N"], shown: Bool[Tensor, "N"]) -> tuple[Int[Tensor, "M"], int]:

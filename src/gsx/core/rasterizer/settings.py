@@ -1,10 +1,13 @@
 """The knobs of the rasterizer. Values live in `conf/rasterizer`; the defaults here are the published 3D-GS rules."""
 
 import math
-from dataclasses import dataclass
-from typing import Annotated
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any
 
+from gsx.core.backend import EAGER, Backend
 from gsx.core.ranges import Count, Range, Share, Steps
+from gsx.core.rasterizer.compositor import Compositor, WithBackend
 
 CUTOFF_SLACK = 1e-3
 """Added to ln(alpha / alpha_min) when tiles are chosen, so that rounding never drops a pixel at the cut-off."""
@@ -18,7 +21,6 @@ CHOICES = {
     "cull": ("published", "tight"),
     "pixel": ("sample", "window"),
     "zoomed": ("plain", "magnified", "resampled"),
-    "path": ("auto", "eager", "compiled"),
     "schedule": ("auto", "chunks", "segments"),
     "evaluation": ("float32", "float64"),
     "accumulation": ("float32", "float64"),
@@ -39,8 +41,8 @@ LARGEST_BATCH = 1 << 27
 
 
 @dataclass(frozen=True, kw_only=True)
-class RasterSettings:
-    """Rules that shape the image, then sizes that only shape the work."""
+class RasterOptions:
+    """Options of the rasterizer: rules that shape the image, then sizes that only shape the work."""
 
     dilation: Annotated[float, Range(LEAST_VARIANCE, 1e6)] = 0.3
     """Added to both diagonal entries of the screen covariance, px^2 (3D-GS, forward.cu)."""
@@ -88,9 +90,10 @@ class RasterSettings:
     """A picture that needs more splat-tile pairs is refused by name (memory is about 100 B a pair, on a GPU 300 B or
     more)."""
     path: str = "eager"
-    """`eager`: plain torch operations, works everywhere. `compiled`: the same mathematics through torch.compile.
-    Blending more than 8 channels and largest weights take the eager way regardless.
-    `auto`: a training run decides (`auto_steps`), and its evaluations follow it; everything else is eager."""
+    """Name of the compositor; plugins may add some. `eager`: plain torch operations, works everywhere. `compiled`: the
+    same mathematics through torch.compile; more than 8 channels and largest weights are blended by `eager` regardless.
+    `gsplat`: the CUDA kernels of that package. `auto`: a training run decides (`auto_steps`), and its evaluations
+    follow it; everything else is eager."""
     auto_steps: Steps = 300
     """path=auto compiles for runs of at least this many steps, where a compiler works."""
     schedule: str = "auto"
@@ -178,3 +181,43 @@ class RasterSettings:
     def published_dilation(self) -> bool:
         """Whether all cameras dilate by `dilation`, compensated or not."""
         return self.zoomed == "plain" and self.pixel == "sample"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RasterSettings(RasterOptions):
+    """Options of the rasterizer with the compositors that `path` may name, beside the eager one of core."""
+
+    compositors: Mapping[str, Compositor] = field(default_factory=dict, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.path not in ("auto", "eager", *self.compositors):
+            names = dict.fromkeys(("auto", "eager", *self.compositors))
+            raise ValueError(f"rasterizer.path is '{self.path}'; choose {', '.join(names)}")
+        if self.compositor_name not in ("eager", *self.compositors):
+            raise ValueError("rasterizer.pixel=window needs a compositor `window`, which gsx.engine has")
+
+    @property
+    def drawn_by(self) -> str:
+        """The path, `eager` where a training run has not decided."""
+        return "eager" if self.path == "auto" else self.path
+
+    @property
+    def compositor_name(self) -> str:
+        """The compositor that draws: that of pixel windows, or that of the path."""
+        return "window" if self.pixel == "window" else self.drawn_by
+
+    @property
+    def backend(self) -> Backend:
+        """What runs kernels beside blending: what the path's compositor brings, or eager torch."""
+        compositor = self.compositors.get(self.drawn_by)
+        return compositor.backend if isinstance(compositor, WithBackend) else EAGER
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options by name, without compositors."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(RasterOptions)}
+
+    def path_on(self, device: str) -> str:
+        """Returns the path by which pictures are drawn on a kind of device: `eager` where nothing compiles."""
+        return self.drawn_by if self.backend.available(device) else "eager"

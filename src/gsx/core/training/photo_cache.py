@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from gsx.core.backend import Backend
 from gsx.core.data.scene import View
 from gsx.core.device import uploaded
 from gsx.core.quality.losses import moments_of
@@ -49,7 +50,7 @@ class PhotoCache:
         return self.bytes_of(view).float() / 255.0
 
     def moments_of(
-        self, view: View, target: Float[Tensor, "3 H W"], compiled: bool
+        self, view: View, target: Float[Tensor, "3 H W"], backend: Backend
     ) -> tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"]] | None:
         """What SSIM takes of a photograph alone, `target`; None where it is not kept: compiled code of a GPU finds all
         at once, and what there is no room for is as soon found anew."""
@@ -60,7 +61,7 @@ class PhotoCache:
         if taken + 2 * target.nbytes > MOMENT_BYTES:
             return None
         with torch.no_grad():  # as the loss finds them: by the same compiled code
-            found = self.moments[view] = moments_of(target, compiled=compiled)
+            found = self.moments[view] = moments_of(target, backend=backend)
         return found
 
     def bytes_of(self, view: View) -> UInt8[Tensor, "3 H W"]:

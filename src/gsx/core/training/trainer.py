@@ -15,7 +15,6 @@ from gsx.core.device import uploaded
 from gsx.core.errors import Stopped
 from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
-from gsx.core.rasterizer import goes_compiled
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.augmenter import accounts_of
 from gsx.core.training.backbone import Observation, Validating, remove_nonfinite
@@ -132,10 +131,10 @@ def view_loss(run: Run, number: int, view: View, terms: Sequence[Term], colour: 
     parts = backward_terms(run, [term for term, _ in divided], number, seen)
     own = 1 - sum(term.replaces for term in terms)
     drawn, rendering = render_for_training(run, view.camera, number, colour)
-    compiled = goes_compiled(run.raster, run.device.type)
+    backend = run.raster.backend.on(run.device.type, learning=True)
     shown = run.views.match_photo(rendering.image, target, view, learning=True)
-    moments = run.photos.moments_of(view, target, compiled) if counted is None else None
-    loss = photometric(blacked(shown, counted), target, run.training.ssim_weight, compiled, moments)
+    moments = run.photos.moments_of(view, target, backend) if counted is None else None
+    loss = photometric(blacked(shown, counted), target, run.training.ssim_weight, backend, moments)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:
         loss = loss + extra

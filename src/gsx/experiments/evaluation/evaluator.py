@@ -22,7 +22,6 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.training.parameter_table import size_of
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.engine.compiled import path_of
 from gsx.experiments.evaluation.detail import Details, details_of, explained
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluated_renders import EvaluatedRenders
@@ -143,7 +142,7 @@ class Evaluator:
         self, image: Float[Tensor, "3 H W"], truth: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None
     ) -> float:
         """By the protocol's variant, compiled if renders would be where the picture is."""
-        return ssim(image, truth, self.options.ssim, counted, path_of(self.run.raster, image.device) == "compiled")
+        return ssim(image, truth, self.options.ssim, counted, self.run.raster.backend.on(image.device.type))
 
     def seen(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H w"]:
         """The part of a picture that is judged, for metrics that know no mask."""
@@ -253,7 +252,7 @@ class Evaluator:
             **module_summaries(run),
             "megabytes": size / 1e6,
             "render_fps": self.frames_per_second(),
-            "render_path": path_of(run.raster, run.device),
+            "render_path": run.raster.path_on(run.device.type),
             "train_seconds": run.progress.seconds,
             "peak_memory_mb": highest(
                 [peak_memory_mb(run.device), *(line.get("memory_mb") for line in run.progress.curves)]

@@ -18,7 +18,6 @@ from gsx.core.plugins import Plugins
 from gsx.core.training.backbone import CAUTION
 from gsx.core.training.run import Run
 from gsx.engine.cache import source_revision
-from gsx.engine.compiled import path_of
 from gsx.engine.machine import device_name
 from gsx.experiments.run_folder.run_key import composition_key, scene_stamp
 from gsx.experiments.runs.build import plan_of
@@ -40,7 +39,7 @@ def environment(run: Run, plugins: Plugins, idle: Collection[str]) -> dict[str, 
         "platform": platform.platform(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
-        "rasterizer": path_of(run.raster, run.device),
+        "rasterizer": run.raster.path_on(run.device.type),
         "source": source_revision(),
         "device": device_name(run.device),
         "processes": run.ranks.size,

@@ -10,11 +10,11 @@ import torch
 from gsx.core.errors import first_line
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
+from gsx.core.rasterizer.compositor import Demanding
 from gsx.core.training.backbone import WithHarmonics
 from gsx.core.training.run import Run
 from gsx.engine.compile_ahead import Step, compile_ahead, warm_camera, warm_splats
 from gsx.engine.compiling import available
-from gsx.engine.path import compiles
 
 logger = logging.getLogger(__name__)
 
@@ -22,6 +22,9 @@ logger = logging.getLogger(__name__)
 def decide(settings: RasterSettings, steps: int, device: torch.device) -> RasterSettings:
     """Replaces path=auto for a training run of `steps` by eager or compiled, and logs the reason."""
     if settings.path != "auto":
+        compositor = settings.compositors.get(settings.compositor_name)
+        if isinstance(compositor, Demanding):
+            compositor.refuse(settings, device)
         return settings
     long_enough = steps >= settings.auto_steps
     compiled = long_enough and available(device.type)
@@ -33,7 +36,7 @@ def decide(settings: RasterSettings, steps: int, device: torch.device) -> Raster
 
 def warm(run: Run, helped: bool = True) -> None:
     """Compiles rasterizer and loss before the first step, and logs the time; `helped`: by a second process."""
-    if not compiles(run.raster, run.device.type):
+    if not run.raster.backend.on(run.device.type).compiled:
         return
     logger.info("compiling the rasterizer once; later runs find it on disk ...")
     backbone = run.backbone
@@ -63,6 +66,6 @@ def compile_beside(settings: RasterSettings, device: torch.device, take: Callabl
             take(compiled)
 
     thread = Thread(target=draw_one, name="compiling", daemon=True)
-    if settings.path != "eager":
+    if settings.path in ("auto", "compiled"):
         thread.start()
     return thread

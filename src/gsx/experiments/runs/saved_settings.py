@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from gsx.core.errors import ConfigError, first_line
 from gsx.core.files import replace_text
 from gsx.core.plugins import Plugins
-from gsx.core.rasterizer import RasterSettings
+from gsx.core.rasterizer import RasterOptions
 from gsx.core.rasterizer.settings import OF_BACKBONES
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.evaluator import EvalOptions
@@ -96,7 +96,7 @@ def with_newer_settings(config: DictConfig) -> DictConfig:
     `clone_split`, which anchors do not have, goes.
     """
     if isinstance(config.get("rasterizer"), DictConfig):
-        options = {key: v for key, v in dataclasses.asdict(RasterSettings()).items() if key not in OF_BACKBONES}
+        options = {key: v for key, v in dataclasses.asdict(RasterOptions()).items() if key not in OF_BACKBONES}
         config.rasterizer = OmegaConf.merge(options, config.rasterizer)
     if "downscale" in (config.get("scene") or {}) and "missing" not in config.scene:
         config.scene.missing = 1.0

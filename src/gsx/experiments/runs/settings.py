@@ -14,11 +14,12 @@ from gsx.core.files import at_home
 from gsx.core.options import fields_with
 from gsx.core.plugins import Component, Plugins
 from gsx.core.ranges import Range, Share
-from gsx.core.rasterizer import RasterSettings
+from gsx.core.rasterizer import RasterOptions, RasterSettings
 from gsx.core.training.regenerator import NamesCode
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
+from gsx.experiments.runs.compositors import with_compositors
 from gsx.experiments.runs.typed import right_key, schema_keys, texts, typed
 from gsx.formats.suffixes import splat_file_at, suffix_of
 
@@ -124,7 +125,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         training=typed(TrainingOptions, loop, "training"),
         modules=modules,
         evaluation=typed(EvalOptions, groups["eval"] | {"lpips": groups["metrics"].get("lpips", {})}, "eval"),
-        raster=typed(RasterSettings, groups["rasterizer"], "rasterizer"),
+        raster=with_compositors(typed(RasterOptions, groups["rasterizer"], "rasterizer"), plugins),
         scene=single["scene"],
         backbone=single["backbone"],
         augmenters=several["augmenter"],
