@@ -17,6 +17,12 @@ from gsx.core.data.camera import Camera, look_at
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
 from gsx.core.rasterizer.reference import render_reference
+from gsx.engine.compositors import COMPOSITORS
+
+
+def any_path(**options: Any) -> RasterSettings:
+    """Settings with all compositors of gsx."""
+    return RasterSettings(**options, compositors=COMPOSITORS)
 
 
 def random_splats(count: int = 150, seed: int = 0, channels: int = 3, size: float = 0.08) -> Splats:

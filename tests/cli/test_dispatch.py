@@ -22,7 +22,6 @@ from tiny import OVERRIDES, tiny_run, words
 from gsx import __version__
 from gsx.cli.dispatch import VERBS, main
 from gsx.core.data.images import write_image
-from gsx.core.rasterizer import RasterSettings
 from gsx.engine.compiling import available
 
 GSX = [sys.executable, "-m", "gsx"]
@@ -88,33 +87,26 @@ def test_eval_draws_by_the_path_of_training_and_names_it(
     environment = json.loads((folder / "environment.json").read_text())
     assert environment["rasterizer"] == "eager"  # so short a run is not compiled for
     (folder / "environment.json").write_text(json.dumps(environment | {"rasterizer": "compiled"}))
-    asked: list[str] = []
+    monkeypatch.setattr("gsx.engine.backend.available", lambda device: True)  # nothing is compiled all the same:
+    monkeypatch.setattr("gsx.engine.backend.HOW", {})
+    monkeypatch.setattr("gsx.engine.compiled.available", lambda device: False)
+    monkeypatch.setattr("gsx.experiments.runs.rasterizer_path.warm", lambda *_, **__: None)
 
-    def takes(settings: RasterSettings, *rest: object) -> bool:
-        asked.append(settings.path)
-        return False  # drawn eagerly after all: this test is not about compiling
-
-    monkeypatch.setattr("gsx.core.rasterizer.render.takes", takes)
-    monkeypatch.setattr("gsx.engine.compiled.takes", lambda settings, **rest: settings.path == "compiled")
-    monkeypatch.setattr("gsx.experiments.runs.rasterizer_path.compiles", lambda settings, device: False)
-    monkeypatch.setattr("gsx.engine.path.available", lambda device: False)
-
-    def evaluated(*overrides: str) -> tuple[str, set[str], str]:
-        asked.clear()
+    def evaluated(*overrides: str) -> tuple[str, str]:
         assert main(["eval", str(folder), *overrides]) == 0
         told = json.loads((folder / "evaluation.json").read_text())
         err = capsys.readouterr().err
         assert f"renders/s ({told['render_path']})" in err
         assert f"at training size, {told['render_path']} path" in (folder / "report.html").read_text()
-        return told["render_path"], set(asked), err
+        return told["render_path"], err
 
-    path, drawn, told = evaluated()
-    assert (path, drawn) == ("compiled", {"compiled"})
+    path, told = evaluated()
+    assert path == "compiled"
     assert "renders/s are now by the compiled path; the evaluation before had" in told
-    path, drawn, told = evaluated("eval.zoom=[1,2]")
-    assert (path, drawn, "are now by" in told) == ("compiled", {"compiled"}, False)
-    path, drawn, told = evaluated("rasterizer.path=eager")
-    assert (path, drawn) == ("eager", {"eager"})
+    path, told = evaluated("eval.zoom=[1,2]")
+    assert (path, "are now by" in told) == ("compiled", False)
+    path, told = evaluated("rasterizer.path=eager")
+    assert path == "eager"
     assert re.search(r"renders/s are now by the eager path; .* had [\d.]+ by the compiled path", told)
 
 

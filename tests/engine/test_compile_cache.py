@@ -20,7 +20,8 @@ from compilations import new_code
 from torch import Tensor
 
 from gsx.core.errors import CompilerError
-from gsx.core.quality.similarity import compiled_correlate, correlate
+from gsx.core.quality.similarity import correlate
+from gsx.engine.backend import COMPILED, compiled_kernel
 from gsx.engine.cache import made_by_one
 from gsx.engine.compile_cache import (
     FOLDER,
@@ -224,10 +225,10 @@ def test_code_of_sizes_that_torch_takes_for_others_lies_beside(folder: Path, mon
     sizes = [(3, 40, 50), (3, 11, 50), (3, 30, 20), (3, 11, 11)]
     with made(monkeypatch) as names:
         for _ in range(2):
-            compiled_correlate.cache_clear()
+            compiled_kernel.cache_clear()
             for size in sizes:
                 maps = torch.rand(size)
-                torch.testing.assert_close(compiled_correlate(1)(maps), correlate(maps, 1))
+                torch.testing.assert_close(COMPILED.kernel(correlate, 1)(maps), correlate(maps, 1))
     assert names == ["correlate", "correlate"]
     assert len(list(folder.glob("*.bin"))) == 2
 

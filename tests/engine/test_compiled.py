@@ -9,14 +9,24 @@ from typing import Any
 import pytest
 import torch
 from compilations import new_code
-from raster_scenes import changed, errors_of, front_camera, leaves, random_splats, render_with_gradients, truth_of
+from raster_scenes import (
+    any_path,
+    changed,
+    errors_of,
+    front_camera,
+    leaves,
+    random_splats,
+    render_with_gradients,
+    truth_of,
+)
 
 from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer import RasterSettings, rasterize
+from gsx.core.rasterizer import rasterize
 from gsx.engine import compiled, lanes
+from gsx.engine.backend import COMPILED
 from gsx.engine.compile_cache import TRACING, file_of, recorded
-from gsx.engine.compiled import Chunks, Rows, Stage, available, room_for_gradients, takes
+from gsx.engine.compiled import Chunks, Rows, Stage, available, room_for_gradients
 from gsx.engine.compiling import IN_VECTORS, OWN_INDICES, WHOLE_LOOPS
 from gsx.engine.kernels import EXP_TOP, Kernels, Rules, exp_polynomial, kernels, thresholds
 from gsx.engine.lanes import Lanes
@@ -25,7 +35,7 @@ from gsx.engine.segments import parts
 
 pytestmark = pytest.mark.skipif(not available(), reason="no working compiler on this machine")
 
-QUICK = RasterSettings(cull="tight", path="compiled", unrolled=2)
+QUICK = any_path(cull="tight", path="compiled", unrolled=2)
 """Two splats unrolled: the loops compile several times faster."""
 
 
@@ -100,7 +110,7 @@ def test_lists_are_cut_where_a_few_are_much_longer() -> None:
 
 def test_the_shipped_number_of_unrolled_splats(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lanes, "chunks_at_most", lambda lengths, chunk: 2)
-    rules = replace(QUICK, unrolled=RasterSettings().unrolled, cull="published")
+    rules = replace(QUICK, unrolled=any_path().unrolled, cull="published")
     splats = random_splats(300, seed=7)
     errors = errors_of(splats, front_camera(), rules, truth_of(splats, front_camera(), rules, depth=False), depth=False)
     assert errors.largest <= 1e-5
@@ -158,7 +168,7 @@ def test_colours_do_not_depend_on_how_many_there_are(left: int) -> None:
 
     def learnt(count: int) -> list[torch.Tensor]:
         given = [value[:count].clone().requires_grad_() for value in (constant, rest, offsets)]
-        colours = colours_of(*given, 3, compiled=True)
+        colours = colours_of(*given, 3, COMPILED)
         (colours * weights[:count]).sum().backward()
         return [colours.detach(), *(value.grad for value in given)]
 
@@ -249,30 +259,36 @@ def test_parts_cover_everything_and_none_is_single() -> None:
 
 
 def test_what_goes_the_eager_way() -> None:
-    assert takes(QUICK, 3, 10, False, "cpu")
-    for refused in [
-        takes(replace(QUICK, path="eager"), 3, 10, False, "cpu"),
-        takes(replace(QUICK, path="auto"), 3, 10, False, "cpu"),
-        takes(QUICK, 9, 10, False, "cpu"),
-        takes(QUICK, 3, 0, False, "cpu"),
-        takes(QUICK, 3, 10, True, "cpu"),
-    ]:
-        assert not refused
+    splats, wide = random_splats(40), random_splats(40, channels=9)
+    eager = replace(QUICK, path="eager")
+    for given, options in ((splats, {"max_weight": True}), (wide, {})):
+        drawn, expected = (rasterize(given, front_camera(), rules, **options) for rules in (QUICK, eager))
+        assert torch.equal(drawn.image, expected.image)
+    assert not torch.equal(
+        rasterize(splats, front_camera(), QUICK).image, rasterize(splats, front_camera(), eager).image
+    )
+    assert (QUICK.path_on("cpu"), eager.path_on("cpu"), replace(QUICK, path="auto").path_on("cpu")) == (
+        "compiled",
+        "eager",
+        "eager",
+    )
 
 
 BROKEN = """
 import torch
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.engine.compile_ahead import warm_splats
+from gsx.engine.compositors import COMPOSITORS
 from gsx.experiments.runs.rasterizer_path import decide
 from gsx.core.data.camera import look_at
 import logging
 logging.basicConfig(level=logging.INFO, format="%(message)s")
 camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=32, height=32)
 splats = warm_splats(torch.device("cpu"))
-pictures = [rasterize(splats, camera, RasterSettings(path=path)).image for path in ("compiled", "compiled", "eager")]
+rules = [RasterSettings(path=path, compositors=COMPOSITORS) for path in ("compiled", "compiled", "eager")]
+pictures = [rasterize(splats, camera, each).image for each in rules]
 assert torch.equal(pictures[0], pictures[2]) and torch.equal(pictures[1], pictures[2])
-assert decide(RasterSettings(path="auto"), 10_000, torch.device("cpu")).path == "eager"
+assert decide(RasterSettings(path="auto", compositors=COMPOSITORS), 10_000, torch.device("cpu")).path == "eager"
 """
 
 

@@ -6,19 +6,19 @@ from pathlib import Path
 
 import pytest
 import torch
-from raster_scenes import changed, front_camera, gradients, leaves, random_splats, soft_splats
+from raster_scenes import any_path, changed, front_camera, gradients, leaves, random_splats, soft_splats
 from tiny import LIGHT, tiny_run
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.files import read_json
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer import RasterSettings, rasterize, rasterize_tiled
+from gsx.core.rasterizer import rasterize, rasterize_tiled
 from gsx.engine.compiling import available
 from gsx.engine.pixel_windows import Met as MetSplat
 from gsx.engine.pixel_windows import axes, behind_splat, splat_gradients
 
-WINDOW = RasterSettings(pixel="window", compensate=True, dilation=0.1)
+WINDOW = any_path(pixel="window", compensate=True, dilation=0.1)
 RULES = (1 / 256, 0.99, 1e-4)
 Matrix = tuple[float, float, float]
 
@@ -181,10 +181,10 @@ def test_pictures_are_nearer_to_much_finer_ones_than_those_of_samples() -> None:
 def test_a_plain_model_keeps_its_dilation_but_for_the_pixel() -> None:
     """Splats much larger than a pixel look as samples draw them; small ones keep the mass that dilation gave them."""
     camera = front_camera(48, 36)
-    plain = RasterSettings(pixel="window")
+    plain = any_path(pixel="window")
     soft = changed(soft_splats(), dtype=torch.float32)
     for splats, near in ((soft, 0.003), (small_splats(), 0.02)):
-        sampled = rasterize(splats, camera, RasterSettings(cull="tight")).image
+        sampled = rasterize(splats, camera, any_path(cull="tight")).image
         assert (rasterize(splats, camera, plain).image - sampled).abs().mean() < near
 
 
@@ -299,4 +299,4 @@ def test_a_run_is_trained_and_looked_at_by_windows(tmp_path: Path) -> None:
 )
 def test_windows_that_mean_nothing_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        RasterSettings(**({"pixel": "window"} | changes))
+        any_path(**({"pixel": "window"} | changes))

@@ -10,8 +10,8 @@ from numpy.polynomial import Legendre, Polynomial
 from torch import Tensor
 from torch.nn import Parameter
 
-from gsx.core.gaussians.bands import compiled_contraction
 from gsx.core.gaussians.sh import BAND_0, colours_of, constant_from_colour, harmonics
+from gsx.engine.backend import COMPILED, compiled_kernel
 from gsx.engine.compiling import available
 
 R3 = 1 / math.sqrt(3)
@@ -171,10 +171,10 @@ def test_colours_of_parameters_compile_once_whatever_their_number() -> None:
         generator = torch.Generator().manual_seed(count)
         sizes = ((count, 1, 3), (count, 15, 3), (count, 3))
         constant, rest, offsets = (Parameter(torch.randn(size, generator=generator)) for size in sizes)
-        colours_of(constant, rest, offsets, 3, compiled=True).sum().backward()
+        colours_of(constant, rest, offsets, 3, COMPILED).sum().backward()
         assert rest.grad is not None
 
-    compiled_contraction.cache_clear()
+    compiled_kernel.cache_clear()
     with new_code() as first:
         learn(9)
     assert "contraction" in first

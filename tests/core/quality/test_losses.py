@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
+from gsx.core.backend import EAGER
 from gsx.core.quality.losses import blur, moments_of, photometric, ssim_map
+from gsx.engine.backend import COMPILED
 from gsx.engine.compiling import available
 
 needs_compiler = pytest.mark.skipif(not available(), reason="no working compiler")
@@ -121,9 +123,9 @@ def test_the_compiled_loss_is_that_of_the_formulas_for_pictures_of_several_sizes
     for shape in ((3, 14, 9), (3, 30, 41), (3, 5, 70)):
         image, target = (picture.float() for picture in pictures(*shape))
         found = []
-        for compiled in (False, True):
+        for backend in (EAGER, COMPILED):
             moved = image.clone().requires_grad_()
-            loss = photometric(moved, target, 0.2, compiled)
+            loss = photometric(moved, target, 0.2, backend)
             loss.backward()
             found.append((loss.detach(), moved.grad))
         torch.testing.assert_close(found[1][0], found[0][0], rtol=1e-6, atol=0)

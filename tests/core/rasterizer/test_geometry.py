@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from raster_scenes import (
+    any_path,
     changed,
     errors_of,
     front_camera,
@@ -18,13 +19,13 @@ from raster_scenes import (
 
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer import RasterSettings, rasterize
+from gsx.core.rasterizer import rasterize
 from gsx.core.rasterizer.geometry import LEAST_SHARE, log_compensation
 from gsx.core.rasterizer.intersections import intersect_tiles
 from gsx.core.rasterizer.projection import project
 from gsx.engine.compiling import available
 
-MIP = RasterSettings(cull="tight", dilation=0.1, compensate=True, unrolled=2)
+MIP = any_path(cull="tight", dilation=0.1, compensate=True, unrolled=2)
 PATHS = ["eager", pytest.param("compiled", marks=pytest.mark.skipif(not available(), reason="no working compiler"))]
 
 
@@ -141,7 +142,7 @@ def test_bounds_see_the_compensated_opacity_and_the_published_radius_does_not() 
 def test_without_compensation_the_same_bits_as_ever() -> None:
     splats, plain = small_splats(seed=8), replace(MIP, compensate=False)
     screen, compensated = project(splats, front_camera(), plain), project(splats, front_camera(), MIP)
-    assert not RasterSettings().compensate
+    assert not any_path().compensate
     assert torch.equal(screen.log_opacities, splats.log_opacities[screen.ids])
     assert (compensated.log_opacities < screen.log_opacities).all()
     for name in ("means", "covariances", "conic_factors"):

@@ -8,6 +8,7 @@ import pytest
 import torch
 from raster_scenes import (
     Errors,
+    any_path,
     changed,
     errors_of,
     front_camera,
@@ -28,12 +29,12 @@ SEEDS = range(3)
 
 @functools.cache
 def truth(seed: int):
-    return truth_of(random_splats(seed=seed), front_camera(), RasterSettings(cull="tight"))
+    return truth_of(random_splats(seed=seed), front_camera(), any_path(cull="tight"))
 
 
 def worst(evaluation: str, accumulation: str, dtype: torch.dtype = torch.float32) -> Errors:
     """Largest errors over the seeds."""
-    rules = RasterSettings(cull="tight", evaluation=evaluation, accumulation=accumulation)
+    rules = any_path(cull="tight", evaluation=evaluation, accumulation=accumulation)
     found = [errors_of(changed(random_splats(seed=s), dtype=dtype), front_camera(), rules, truth(s)) for s in SEEDS]
     return Errors(max(e.largest for e in found), max(e.mean for e in found), max(e.gradient for e in found))
 
@@ -71,7 +72,7 @@ def blended(screen, dtype: torch.dtype, rules: RasterSettings) -> torch.Tensor:
 
 def test_float64_work_on_float32_splats_leaves_only_the_rounding_of_the_result() -> None:
     # long needles thinner than a pixel, where the exponent cancels most
-    rules = RasterSettings(cull="tight", dilation=1e-3)
+    rules = any_path(cull="tight", dilation=1e-3)
     splats = random_splats()
     splats = changed(splats, scales=splats.scales * torch.tensor([10.0, 1e-3, 1e-3]))
     screen = project(splats, front_camera(), rules)
@@ -85,7 +86,7 @@ def test_float64_work_on_float32_splats_leaves_only_the_rounding_of_the_result()
 @pytest.mark.parametrize("path", ["eager", "compiled"] if available() else ["eager"])
 @pytest.mark.parametrize("accumulation", ["float32", "float64"])
 def test_where_nothing_is_seen_the_picture_is_empty(accumulation: str, path: str) -> None:
-    camera, rules = front_camera(20, 15), RasterSettings(accumulation=accumulation, path=path)
+    camera, rules = front_camera(20, 15), any_path(accumulation=accumulation, path=path)
     behind = random_splats(seed=0)
     behind = replace(behind, means=behind.means - 1e3 * camera.rotation[2].to(behind.means))
     rendering = rasterize(behind, camera, rules)
@@ -99,7 +100,7 @@ def test_where_nothing_is_seen_the_picture_is_empty(accumulation: str, path: str
 def test_every_pair_of_formats_keeps_the_dtype_of_the_splats(
     evaluation: str, accumulation: str, dtype: torch.dtype
 ) -> None:
-    rules = RasterSettings(evaluation=evaluation, accumulation=accumulation)
+    rules = any_path(evaluation=evaluation, accumulation=accumulation)
     splats = leaves(random_splats(20), dtype)
     rendering = rasterize(splats, front_camera(20, 20), rules, depth=True, absolute_gradient=True, max_weight=True)
     (rendering.image.mean() + rendering.depth.mean()).backward()
@@ -127,4 +128,4 @@ def test_every_pair_of_formats_keeps_the_dtype_of_the_splats(
 )
 def test_settings_that_cannot_work_are_refused(fields: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        RasterSettings(**fields)
+        any_path(**fields)

