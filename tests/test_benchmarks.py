@@ -9,12 +9,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from raster_scenes import any_path
 from torch import Tensor
 
 import rasterizer as benchmark
 import step
 from gsx.core.errors import InputError
-from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.projection import project
 from gsx.core.rasterizer.reference import render_reference
 from gsx.engine import compiled
@@ -570,7 +570,7 @@ def test_settings_of_the_rasterizer_are_measured_against_float64(tmp_path: Path)
 @pytest.mark.parametrize("cuda", [False, True])
 @pytest.mark.parametrize("cull", ["published", "tight"])
 def test_changes_of_the_rasterizer_are_valid_settings(cull: str, cuda: bool) -> None:
-    base = RasterSettings(cull=cull)
+    base = any_path(cull=cull)
     changes = knobs.changes_of(base, ["eager", "compiled"], cuda)
     assert changes[:2] == [{}, {"path": "compiled"}]
     assert all(replace(base, **change) != base for change in changes[1:])

@@ -62,7 +62,7 @@ def test_no_file_class_or_function_is_long() -> None:
 @pytest.mark.parametrize("file", LOOP)
 def test_the_loop_names_no_feature(file: str) -> None:
     """Neither a registered component nor what it does."""
-    kinds = ("module", "backbone", "augmenter", "regenerator", "compositor", "tracker")
+    kinds = ("module", "backbone", "augmenter", "regenerator", "tracker")
     registered = {name for kind, name in plugins().registry.components if kind in kinds} - {"callable"}
     stems = {"exposure", "poses", "blur", "distractor", "coarse", "supersampl", "bilateral", "cuda_graph"}
     pattern = re.compile("|".join(re.escape(name) for name in sorted(registered | stems)))

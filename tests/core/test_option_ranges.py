@@ -10,7 +10,7 @@ from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
 from gsx.core.options import flattened
 from gsx.core.ranges import Range, Share, beyond_range, without_range
-from gsx.core.rasterizer import RasterSettings
+from gsx.core.rasterizer import RasterOptions
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.run_folder.general_options import GeneralOptions
@@ -19,7 +19,7 @@ from gsx.experiments.runs.settings import Budget
 from gsx.experiments.runs.typed import typed
 from gsx.experiments.tables.plan import Experiment
 
-GENERAL = [GeneralOptions, TrainingOptions, EvalOptions, RasterSettings, Budget, Checks, Experiment]
+GENERAL = [GeneralOptions, TrainingOptions, EvalOptions, RasterOptions, Budget, Checks, Experiment]
 
 
 @dataclass(frozen=True)

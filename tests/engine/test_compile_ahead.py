@@ -14,7 +14,7 @@ from processes import Begin
 from tiny import tiny_settings
 
 from gsx.builtin import plugins
-from gsx.core.rasterizer import RasterSettings
+from raster_scenes import any_path
 from gsx.core.training.trainer import train_step
 from gsx.engine import compile_ahead
 from gsx.engine.compile_ahead import Step, end, help_compiling, helper, needed
@@ -29,7 +29,7 @@ CPU = torch.device("cpu")
 @pytest.fixture
 def compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets a compiler work where calls are only recorded; its code would lie in a folder of the test."""
-    monkeypatch.setattr("gsx.engine.path.available", lambda _: True)
+    monkeypatch.setattr("gsx.engine.backend.available", lambda _: True)
     monkeypatch.setattr("gsx.engine.compiled.available", lambda _: True)
     monkeypatch.setattr("gsx.engine.compile_cache.place", lambda: tmp_path / "functions")
 
@@ -97,7 +97,7 @@ def test_the_helper_compiles_the_same_calls_from_the_other_end(monkeypatch: pyte
     monkeypatch.setattr("torch.get_num_threads", lambda: 2)
     monkeypatch.setattr("torch.set_num_threads", lambda _: None)
     monkeypatch.setattr(compile_ahead, "end_with_input", lambda: None)
-    step = Step(settings=RasterSettings(path="compiled", dilation=0.2, zoomed="magnified"), sh_degree=2)
+    step = Step(settings=any_path(path="compiled", dilation=0.2, zoomed="magnified"), sh_degree=2)
     with helper(step):
         (process,) = begun
         assert process.ended == []
@@ -120,7 +120,7 @@ def test_help_is_for_several_functions_and_threads(
     monkeypatch.setattr(compile_ahead, "lacking", lambda _: range(missing))
     monkeypatch.setattr(compile_ahead, "place", lambda: tmp_path)
     monkeypatch.setattr(compile_ahead, "draw_one", lambda *_: None)
-    compile_ahead.compile_ahead(Step(settings=RasterSettings(), sh_degree=3), CPU, helped)
+    compile_ahead.compile_ahead(Step(settings=any_path(), sh_degree=3), CPU, helped)
     assert [words["sh_degree"] for words in begun] == ([3] if begins else [])
 
 
@@ -130,7 +130,7 @@ def test_a_process_that_cannot_be_begun_is_done_without(monkeypatch: pytest.Monk
 
     monkeypatch.setattr("subprocess.Popen", refuse)
     monkeypatch.setattr("torch.get_num_threads", lambda: 2)
-    with helper(Step(settings=RasterSettings())):
+    with helper(Step(settings=any_path())):
         pass
 
 

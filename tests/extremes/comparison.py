@@ -4,6 +4,7 @@ import functools
 from dataclasses import dataclass, replace
 
 import torch
+from raster_scenes import any_path
 from torch import Tensor
 
 from extremes.cases import Case
@@ -52,7 +53,7 @@ class Truth:
 
 def rules_of(case: Case, cull: str, path: str = "eager") -> RasterSettings:
     few = {"unrolled": 2}  # compiles several times faster, and rounds alike
-    return RasterSettings(**(few | {"cull": cull, "path": path} | dict(case.rules)))
+    return any_path(**(few | {"cull": cull, "path": path} | dict(case.rules)))
 
 
 def leaves(splats: Splats, dtype: torch.dtype) -> Splats:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from raster_scenes import any_path
 from torch import Tensor
 
 from extremes.cases import ball, scaled, view
@@ -66,10 +67,9 @@ def rules(alpha_min: st.SearchStrategy[float], dilation: st.SearchStrategy[float
     """Rules of every path; `alpha_min` of the eager one only, since compiled code holds it as a constant."""
     cull = st.sampled_from(["published", "tight"])
     builds = [
-        st.builds(RasterSettings, cull=cull, dilation=dilation, path=st.just(path), unrolled=st.just(2))
-        for path in paths()
+        st.builds(any_path, cull=cull, dilation=dilation, path=st.just(path), unrolled=st.just(2)) for path in paths()
     ]
-    return st.one_of(st.builds(RasterSettings, cull=cull, dilation=dilation, alpha_min=alpha_min), *builds)
+    return st.one_of(st.builds(any_path, cull=cull, dilation=dilation, alpha_min=alpha_min), *builds)
 
 
 RULES = rules(st.sampled_from([1 / 255, 1e-9]), st.sampled_from([0.3, 1e-6, 1e3]))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from gsx.core.backend import EAGER
+from gsx.core.backend import EAGER, Backend
 from gsx.core.quality.losses import blur, moments_of, photometric, ssim_map
 from gsx.engine.backend import COMPILED
 from gsx.engine.compiling import available
@@ -101,21 +101,21 @@ def test_the_blur_is_its_own_adjoint() -> None:
     assert float((blur(first, 5) * second).sum()) == pytest.approx(float((first * blur(second, 5)).sum()), rel=1e-12)
 
 
-@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
-def test_gradient_of_the_loss(compiled: bool) -> None:
+@pytest.mark.parametrize("backend", [EAGER, pytest.param(COMPILED, marks=needs_compiler)])
+def test_gradient_of_the_loss(backend: Backend) -> None:
     image, target = pictures(3, 8, 6)
     image.requires_grad_()
     for weight in (0.2, 1.0):
-        assert gradcheck(lambda picture: photometric(picture, target, weight, compiled), (image,))  # noqa: B023
+        assert gradcheck(lambda picture: photometric(picture, target, weight, backend), (image,))  # noqa: B023
 
 
-@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
-def test_what_is_known_of_a_target_is_not_found_anew(compiled: bool) -> None:
+@pytest.mark.parametrize("backend", [EAGER, pytest.param(COMPILED, marks=needs_compiler)])
+def test_what_is_known_of_a_target_is_not_found_anew(backend: Backend) -> None:
     image, target = (picture.float() for picture in pictures(3, 14, 9))
-    known = moments_of(target, compiled=compiled)
-    assert torch.equal(photometric(image, target, 0.2, compiled, known), photometric(image, target, 0.2, compiled))
-    other = moments_of(1 - target, compiled=compiled)
-    assert not torch.equal(photometric(image, target, 0.2, compiled, other), photometric(image, target, 0.2, compiled))
+    known = moments_of(target, backend=backend)
+    assert torch.equal(photometric(image, target, 0.2, backend, known), photometric(image, target, 0.2, backend))
+    other = moments_of(1 - target, backend=backend)
+    assert not torch.equal(photometric(image, target, 0.2, backend, other), photometric(image, target, 0.2, backend))
 
 
 @needs_compiler

@@ -21,6 +21,7 @@ class NoOptions:
     """Options of a compositor that has none."""
 
 
+@runtime_checkable
 class Compositor(Protocol):
     """Blends splats front to back; differentiable in the means, factors, opacities and channels."""
 
