@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 import torch
 from processes import Begin
+from raster_scenes import any_path
 from tiny import tiny_settings
 
 from gsx.builtin import plugins
-from raster_scenes import any_path
 from gsx.core.training.trainer import train_step
 from gsx.engine import compile_ahead
 from gsx.engine.compile_ahead import Step, end, help_compiling, helper, needed

@@ -6,7 +6,6 @@ import pytest
 import torch
 from raster_scenes import any_path
 
-from gsx.core.rasterizer import RasterSettings
 from gsx.engine.compile_ahead import WARM_SPLATS
 from gsx.experiments.runs import rasterizer_path
 from gsx.experiments.runs.rasterizer_path import compile_beside, decide
@@ -65,4 +64,8 @@ def test_who_asks_for_the_eager_path_keeps_it(compiler):
         ("eager", 300, True, "eager"),
     ],
 )
-from raster_scenes import any_path
+def test_auto_decides_by_steps_and_compiler(
+    path: str, steps: int, works: bool, decided: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rasterizer_path, "available", lambda _: works)
+    assert decide(any_path(path=path, auto_steps=300), steps, CPU).path == decided
