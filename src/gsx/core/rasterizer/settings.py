@@ -195,7 +195,7 @@ class RasterSettings(RasterOptions):
             names = dict.fromkeys(("auto", "eager", *self.compositors))
             raise ValueError(f"rasterizer.path is '{self.path}'; choose {', '.join(names)}")
         if self.compositor_name not in ("eager", *self.compositors):
-            raise ValueError("rasterizer.pixel=window needs a compositor `window`, which gsx.engine has")
+            raise ValueError("rasterizer.pixel=window needs a compositor `window`, which gsx registers")
 
     @property
     def drawn_by(self) -> str:
