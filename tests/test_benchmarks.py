@@ -574,7 +574,6 @@ def test_changes_of_the_rasterizer_are_valid_settings(cull: str, cuda: bool) -> 
     changes = knobs.changes_of(base, ["eager", "compiled"], cuda)
     assert changes[:2] == [{}, {"path": "compiled"}]
     assert all(replace(base, **change) != base for change in changes[1:])
-    assert ({"evaluation": "tf32"} in changes) == cuda
     assert ({"tile_size": 32} in changes) == (cull == "tight")
     assert {"path": "compiled", "schedule": "chunks" if cuda else "segments"} in changes
     assert not any("path" in change for change in knobs.changes_of(base, ["eager"], cuda))

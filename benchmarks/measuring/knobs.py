@@ -101,15 +101,13 @@ def changes_of(base: RasterSettings, paths: Sequence[str], cuda: bool) -> list[d
             usual = "segments" if cuda else "chunks"
             changes += [{"path": "compiled", name: v} for v in values if v != usual and "compiled" in paths]
         else:
-            changes += [{name: v} for v in values if v != getattr(base, name) and suits(name, v, base, cuda)]
+            changes += [{name: v} for v in values if v != getattr(base, name) and suits(name, v, base)]
     return changes
 
 
-def suits(name: str, value: Any, base: RasterSettings, cuda: bool) -> bool:
-    """Whether a value means something with the base settings on this device."""
-    if (name, value) == ("tile_size", 32):
-        return base.cull == "tight"
-    return cuda or value != "tf32"
+def suits(name: str, value: Any, base: RasterSettings) -> bool:
+    """Returns whether a value can be combined with the base settings."""
+    return (name, value) != ("tile_size", 32) or base.cull == "tight"
 
 
 def spelled(changes: Mapping[str, Any]) -> str:

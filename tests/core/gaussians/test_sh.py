@@ -10,6 +10,7 @@ from numpy.polynomial import Legendre, Polynomial
 from torch import Tensor
 from torch.nn import Parameter
 
+from gsx.core.backend import EAGER, Backend
 from gsx.core.gaussians.sh import BAND_0, colours_of, constant_from_colour, harmonics
 from gsx.engine.backend import COMPILED, compiled_kernel
 from gsx.engine.compiling import available
@@ -140,12 +141,12 @@ def test_gradient_is_that_of_finite_differences(degree: int) -> None:
     assert torch.autograd.gradcheck(lambda c, *a: colours_of(c + 30, *a, degree), (constant, rest, offsets))  # above 0
 
 
-@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
-def test_a_splat_at_the_camera_has_a_finite_gradient(compiled: bool) -> None:
+@pytest.mark.parametrize("backend", [EAGER, pytest.param(COMPILED, marks=needs_compiler)])
+def test_a_splat_at_the_camera_has_a_finite_gradient(backend: Backend) -> None:
     constant, rest, offsets = coefficients()
     offsets[4] = 0
     constant, rest, offsets = (value.requires_grad_() for value in (constant, rest, offsets))
-    colours_of(constant, rest, offsets, 3, compiled).sum().backward()
+    colours_of(constant, rest, offsets, 3, backend).sum().backward()
     assert offsets.grad is not None
     assert torch.isfinite(offsets.grad).all()
 
@@ -154,9 +155,9 @@ def test_a_splat_at_the_camera_has_a_finite_gradient(compiled: bool) -> None:
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_compiled_colours_and_their_gradients_are_the_eager_ones(degree: int) -> None:
     found = []
-    for compiled in (False, True):
+    for backend in (EAGER, COMPILED):
         leaves = [value.clone().requires_grad_() for value in coefficients(seed=3)]
-        colours = colours_of(*leaves, degree, compiled)
+        colours = colours_of(*leaves, degree, backend)
         (colours * torch.linspace(0.5, 2, 27).view(9, 3)).sum().backward()
         found.append([colours.detach(), *(leaf.grad for leaf in leaves)])
     for eager, fast in zip(*found, strict=True):

@@ -8,6 +8,7 @@ import torch
 from tiny import final_tensors, tiny_run
 from torch import Tensor
 
+from gsx.core.backend import EAGER
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import View
 from gsx.core.quality.losses import moments_of
@@ -54,16 +55,14 @@ def test_what_ssim_takes_of_a_photograph_is_found_once_while_there_is_room(monke
     monkeypatch.setattr(module, "MOMENT_BYTES", 2 * 2 * 4 * BYTES + 1)  # two of each four-byte number of two pictures
     photographs = PhotoCache(torch.device("cpu"), room=0)
     photographs.see(views)
-    first = [
-        photographs.moments_of(view, picture, compiled=False) for view, picture in zip(views, pictures, strict=True)
-    ]
+    first = [photographs.moments_of(view, picture, EAGER) for view, picture in zip(views, pictures, strict=True)]
     assert first[2] is None
     for found, view, picture in zip(first[:2], views, pictures, strict=False):
-        assert photographs.moments_of(view, picture, compiled=False) is found
+        assert photographs.moments_of(view, picture, EAGER) is found
         assert all(map(torch.equal, found, moments_of(picture)))
     photographs.see(views[2:])
     assert not photographs.moments
-    assert photographs.moments_of(views[2], pictures[2], compiled=False) is not None
+    assert photographs.moments_of(views[2], pictures[2], EAGER) is not None
 
 
 @pytest.mark.parametrize(
