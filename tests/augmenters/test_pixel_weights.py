@@ -13,13 +13,14 @@ from gsx.augmenters.pixel_weights import (
     sampled_better,
     sampling_scores,
     splatsure,
+    undilated_radii,
     unscaled_weights,
 )
 from gsx.augmenters.pseudo_options import WEIGHT_MAPS
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.reduction import Reduction
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer import RasterSettings, undilated_radii
+from gsx.core.rasterizer import RasterSettings
 
 
 def at(distance: float, width: int = 40, target: float = 0.0) -> Camera:

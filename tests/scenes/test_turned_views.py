@@ -14,7 +14,7 @@ from torch import Tensor
 from gsx.core.data.images import read_image, write_image
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
-from gsx.experiments.runs.orbit import upright
+from gsx.experiments.viewer.up_direction import upright
 from gsx.scenes.colmap import load
 from gsx.scenes.exif import orientation_of
 from gsx.scenes.orientation import WITHOUT_MIRROR, oriented, oriented_camera

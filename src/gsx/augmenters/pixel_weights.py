@@ -10,7 +10,8 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import Reduction, as_blocks
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer import RasterSettings, rasterize, undilated_radii
+from gsx.core.rasterizer import RasterSettings, on_screen, rasterize, without_colours
+from gsx.core.rasterizer.boxes import three_sigma
 from gsx.core.shapes import Float, Int, UInt8
 
 Draw: TypeAlias = Callable[[Camera], Splats]
@@ -119,3 +120,21 @@ def agreeing(
 def in_bytes(weights: Float[Tensor, "h w"]) -> UInt8[Tensor, "h w"]:
     """Weights from 0 to 1 as 0 to 255."""
     return (weights * 255 + 0.5).clamp(0, 255).to(torch.uint8)
+
+
+@torch.no_grad()
+def undilated_radii(
+    means: Float[Tensor, "N 3"],
+    scales: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    camera: Camera,
+    settings: RasterSettings,
+) -> Float[Tensor, "N"]:
+    """Returns three standard deviations on the screen before dilation, px; -1: it does not touch the raster.
+
+    3D-GS's formula (forward.cu), whose floor makes those much thinner than a pixel alike; not rounded up.
+    """
+    screen, on = on_screen(without_colours(means, scales, quats), camera, settings)
+    dilation, _ = settings.dilation_at(camera.focal)
+    undilated = screen.covariances[on] - dilation * means.new_tensor([1, 0, 1])
+    return torch.full_like(means[:, 0], -1).index_copy_(0, screen.ids[on], three_sigma(*undilated.unbind(1)))

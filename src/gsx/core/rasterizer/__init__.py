@@ -6,7 +6,7 @@ from gsx.core.rasterizer.projection import drawable, repeat_rows, take_rows
 from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
 from gsx.core.rasterizer.settings import RasterOptions, RasterSettings
 from gsx.core.rasterizer.tiled import TILE_PIXELS, TiledRendering, rasterize_tiled
-from gsx.core.rasterizer.visibility import touches, undilated_radii
+from gsx.core.rasterizer.visibility import on_screen, touches, without_colours
 
 __all__ = [
     "TILE_PIXELS",
@@ -16,12 +16,13 @@ __all__ = [
     "ScreenStatistics",
     "TiledRendering",
     "drawable",
+    "on_screen",
     "rasterize",
     "rasterize_tiled",
     "repeat_rows",
     "take_rows",
     "touches",
-    "undilated_radii",
+    "without_colours",
 ]
 
 torch.exp(torch.zeros(1))

@@ -5,7 +5,6 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer.boxes import three_sigma
 from gsx.core.rasterizer.intersections import boxes_of
 from gsx.core.rasterizer.projection import ScreenSplats, drawable, project
 from gsx.core.rasterizer.settings import RasterSettings
@@ -42,21 +41,3 @@ def on_screen(splats: Splats, camera: Camera, settings: RasterSettings) -> tuple
     """(splats that the camera may show, those of them whose published square's tiles touch the raster)."""
     screen = project(splats, camera, settings)
     return screen, boxes_of(screen, camera, settings).radii > 0
-
-
-@torch.no_grad()
-def undilated_radii(
-    means: Float[Tensor, "N 3"],
-    scales: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    camera: Camera,
-    settings: RasterSettings,
-) -> Float[Tensor, "N"]:
-    """Three standard deviations on the screen before dilation, px; -1 for Gaussians that do not touch the raster.
-
-    3D-GS's formula (forward.cu), whose floor makes those much thinner than a pixel alike; not rounded up.
-    """
-    screen, on = on_screen(without_colours(means, scales, quats), camera, settings)
-    dilation, _ = settings.dilation_at(camera.focal)
-    undilated = screen.covariances[on] - dilation * means.new_tensor([1, 0, 1])
-    return torch.full_like(means[:, 0], -1).index_copy_(0, screen.ids[on], three_sigma(*undilated.unbind(1)))

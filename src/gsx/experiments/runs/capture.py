@@ -14,7 +14,8 @@ from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.quality.sharpness import sharpness_line
 from gsx.core.shapes import Bool, Float
 from gsx.experiments.runs.load_scene import in_one_place
-from gsx.experiments.runs.orbit import axes_about, nearest_to_rays, upright
+from gsx.experiments.runs.orbit import axes_about, nearest_to_rays
+from gsx.experiments.viewer.up_direction import upright
 from gsx.scenes.photo_source import PhotoSource
 
 POINTS = 3000

@@ -25,8 +25,8 @@ from gsx.core.training.run import Run
 from gsx.experiments.reports.viewer_page import viewer_page
 from gsx.experiments.runs.bake import bake
 from gsx.experiments.runs.load_scene import unit_of
-from gsx.experiments.runs.orbit import upright
 from gsx.experiments.runs.settings import Settings
+from gsx.experiments.viewer.up_direction import upright
 from gsx.formats.arrays import arrays_of, gaussians_from
 from gsx.formats.axis_names import AUTO
 from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply

@@ -23,6 +23,7 @@ from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError, nearest
 from gsx.core.files import replacing
 from gsx.core.shapes import Float, UInt8
+from gsx.experiments.viewer.up_direction import upright
 
 PARALLEL = 0.01
 """Viewing rays whose mean squared sine against one direction is below this (6 degrees) meet nowhere reliable."""
@@ -38,8 +39,6 @@ SLOWEST, FASTEST = 0.1, 1000
 """Frames per second of an animation."""
 GIF_FASTEST = 50
 """GIF delays are whole hundredths of a second, and viewers slow down below two of them."""
-UPRIGHT = 0.05
-"""Weight of the mean image-up against level horizons; small: horizons win wherever they say anything."""
 
 
 @dataclass(frozen=True)
@@ -299,16 +298,3 @@ def encode(encoding: Encoding, path: Path, frames: Iterator[UInt8[Tensor, "H W 3
             picture = av.VideoFrame.from_ndarray(frame[:height, :width].contiguous().numpy(), format="rgb24")
             output.mux(stream.encode(picture))
         output.mux(stream.encode())
-
-
-def upright(rotations: Float[Tensor, "K 3 3"]) -> Float[Tensor, "3"]:
-    """Return the up direction: near the mean image-up, and across the images' horizontal axes where those differ.
-
-    Photographers hold cameras level but tilt them: the mean image-up alone leans away from what a half ring surrounds.
-    """
-    right, up = rotations[:, 0], -rotations[:, 1]
-    level = right.T @ right / len(right) + UPRIGHT * torch.eye(3, dtype=right.dtype)
-    solved = torch.linalg.solve(level, up.mean(0))
-    if solved.norm() < 1e-6:  # cameras rolled every way
-        return up[0]
-    return solved / solved.norm()

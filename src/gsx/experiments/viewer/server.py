@@ -23,10 +23,10 @@ from gsx.core.errors import GsxError, InputError
 from gsx.core.gaussians.quaternions import quaternions_of
 from gsx.core.packages import require
 from gsx.core.shapes import Float
-from gsx.experiments.runs.orbit import upright
 from gsx.experiments.viewer.camera_path import CameraPath, Keyframe, write_camera_path
 from gsx.experiments.viewer.pictures import BESIDE, FILTERS, Model, Pose, RunModel, picture
 from gsx.experiments.viewer.screens import FrameServer, Screen
+from gsx.experiments.viewer.up_direction import upright
 from gsx.formats.origin import Origin
 
 logger = logging.getLogger(__name__)
