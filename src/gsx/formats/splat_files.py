@@ -27,7 +27,7 @@ from gsx.formats.sog_reading import decode_sog, sog_is_antialiased
 from gsx.formats.splat import decode_splat
 from gsx.formats.spz import decode_spz, encode_spz, is_antialiased
 from gsx.formats.standard_ply import decode_standard_ply
-from gsx.formats.suffixes import SPZ_VERSIONS, STANDARD, splat_file_at, suffix_of
+from gsx.formats.suffixes import SPZ_VERSIONS, STANDARD, WRITTEN, splat_file_at, suffix_of
 
 logger = logging.getLogger(__name__)
 
@@ -95,10 +95,12 @@ def write_gaussians(
     elif suffix == ".spz":
         turned = to_training_axes(away(gaussians, origin), spz.axes)  # a turn by 180 degrees goes both ways
         write_whole(path, encode_spz(arrays_of(turned), compensated, spz.version, spz.axes))
+    elif suffix == ".sog":
+        write_whole(path, encode_sog(arrays_of(away(gaussians, origin)), compensated))
+    elif suffix == ".compressed.ply":
+        write_whole(path, encode_compressed_ply(arrays_of(away(gaussians, origin)), comments))
     else:
-        arrays = arrays_of(away(gaussians, origin))
-        compact = encode_sog(arrays, compensated) if suffix == ".sog" else encode_compressed_ply(arrays, comments)
-        write_whole(path, compact)
+        raise InputError(f"{path}: gsx does not write {suffix}: give a name that ends in {', '.join(WRITTEN)}")
 
 
 def write_columns(
