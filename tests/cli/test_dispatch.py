@@ -418,7 +418,7 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     "nothing for a group": (lambda t: words(t / "run", "training=null"), "training is null, but it is a group"),
     "a value for a group in a group": (
         lambda t: words(t / "run", "training.exposure=3"),
-        "training.exposure is no value but a group of settings: give training.exposure.NAME=VALUE",
+        "training.exposure is 3, but it is a group of settings: give training.exposure.NAME=VALUE",
     ),
     "a word for a list": (lambda t: words(t / "run", "eval.zoom=abc"), "eval.zoom takes a list: give eval.zoom=[...]"),
     "a value for hydra": (lambda t: words(t / "run", "hydra=3"), "give hydra.NAME=VALUE or hydra/GROUP=NAME"),

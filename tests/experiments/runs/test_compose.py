@@ -142,8 +142,8 @@ def test_published_values_of_gs3d() -> None:
 @pytest.mark.parametrize("backbone", ["gs3d", "mip_splatting"])
 def test_the_preset_for_zooming_in_holds_for_both_forms_of_gaussians(backbone: str) -> None:
     plain, zoom = composed(f"backbone={backbone}"), composed(f"backbone={backbone}", "preset=zoom")
-    assert (plain.training.supersampling.factor, plain.backbone.options.rates.shortened) == (1, 0.0)
-    assert (zoom.training.supersampling.factor, zoom.training.supersampling.start) == (2, 0.8)
+    assert (plain.modules["supersampling"].options.factor, plain.backbone.options.rates.shortened) == (1, 0.0)
+    assert (zoom.modules["supersampling"].options.factor, zoom.modules["supersampling"].options.start) == (2, 0.8)
     assert (zoom.backbone.options.filter, zoom.backbone.options.rates.shortened) == ("mip", 0.4)
     published = composed(f"backbone={backbone}", "preset=zoom", "iterations=30000").backbone.options
     assert published.rates == replace(plain.backbone.options.rates, shortened=0.4)  # the same where nothing is shorter
@@ -154,7 +154,7 @@ def test_plain_gsx_trains_for_zooming_in_and_3d_gs_is_one_word_away() -> None:
     assert default.backbone.component.name == "gs3d_zoom"
     assert replace(default.backbone.options, name="gs3d") == spelt.backbone.options
     assert default.training == spelt.training
-    assert (plain.backbone.options.filter, plain.training.supersampling.factor) == ("none", 1)
+    assert (plain.backbone.options.filter, plain.modules["supersampling"].options.factor) == ("none", 1)
     assert plain.backbone.options.rates.shortened == 0
 
 
@@ -261,8 +261,8 @@ def test_settings_that_a_run_is_older_than_can_be_asked_for(tmp_path: Path) -> N
     words = ["eval.colours=fitted", "training.exposure.when=always", "backbone.mip.views=2", "scene.disturb.pose=2"]
     words += ["augmenter.upscale.weight_map=none", "eval.poses=aligned", "training.poses.when=auto"]
     settings = read_config(tmp_path / "config.yaml", plugins(), words)
-    assert (settings.evaluation.colours, settings.training.exposure.when) == ("fitted", "always")
-    assert (settings.evaluation.poses, settings.training.poses.when) == ("aligned", "auto")
+    assert (settings.evaluation.colours, settings.modules["exposure"].options.when) == ("fitted", "always")
+    assert (settings.evaluation.poses, settings.modules["poses"].options.when) == ("aligned", "auto")
     assert settings.backbone.options.mip.views == 2
     assert settings.resolved["eval"]["colours"] == "fitted"
     with pytest.raises(ConfigError, match=r"Did you mean 'eval.colours'"):

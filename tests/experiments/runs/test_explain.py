@@ -21,10 +21,10 @@ def test_a_value_with_its_range_and_every_file_that_sets_it() -> None:
     assert lines[:2] == ["training.supersampling.factor = 2", "  whole number from 1 to 16"]
     places = [re.fullmatch(r"  conf/(\S+):(\d+)  (\S+)", line) for line in lines]
     told = {found[1]: (int(found[2]), found[3]) for found in places if found}
-    assert list(told) == ["preset/zoom.yaml", "config.yaml"]
+    assert list(told) == ["preset/zoom.yaml", "module/supersampling.yaml"]
     for name, (number, value) in told.items():
-        assert (CONF / name).read_text().splitlines()[number - 1].split("#")[0].strip() == f"supersample: {value}"
-    assert "      through a raster twice as fine, reduced as the photographs were" in lines
+        assert (CONF / name).read_text().splitlines()[number - 1].split("#")[0].strip() == f"factor: {value}"
+    assert "      through a raster twice as fine, reduced as the photos were" in lines
 
 
 def test_values_told_are_values_composed() -> None:
