@@ -430,7 +430,7 @@ def test_bad_photographs_are_counted_over_seeds() -> None:
     row = captures.fault_row("fox", "pose", found)
     assert (row["found"], row["others"], row["shift"]) == ("9 of 10", "1 of 90", "0.03 ± 0.01")
     assert row["off"] == "0.4"
-    turned = {"name": "a", "shift": [-value for value in captures.turn_of("a", captures.TURNED)]}
+    turned = {"name": "a", "shift": [-value for value in captures.pair_of("pose", "a", captures.TURNED)]}
     assert captures.error_of(turned) == 0
     assert "found" not in captures.fault_row("fox", "none", [found[0] | {"bad": 0, "found": 0}])
 

@@ -157,12 +157,12 @@ def scaling_plot(rows: Sequence[dict[str, Any]]) -> str:
     plot = Plot(decades(axis_of((x for x, _ in points), log=True)), decades(axis_of((y for _, y in points), log=True)))
     rasters = sorted({raster for _, raster in curves}, key=lambda raster: [len(raster), raster])
     body = (
-        drawing().frame(plot, "splat-tile pairs")
+        str(drawing().frame(plot, "splat-tile pairs"))
         + f'<text x="{plot.LEFT}" y="{plot.TOP}">forward + backward, ms</text>'
     )
     for number, ((path, raster), group) in enumerate(sorted(curves.items())):
         series = Series(name=path, x=[x for x, _ in group], y=[y for _, y in group], dots=True)
-        line = drawing().curve(plot, series) + legend(len(curves) - number, f"{path}, {raster}")
+        line = str(drawing().curve(plot, series)) + legend(len(curves) - number, f"{path}, {raster}")
         body += f"<g {pen(path, rasters.index(raster))}>{line}</g>"
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {plot.WIDTH} {plot.HEIGHT}" width="{2 * plot.WIDTH}">'
