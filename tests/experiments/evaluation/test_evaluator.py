@@ -20,7 +20,7 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.photo_cache import PhotoCache
-from gsx.core.training.run import Run, TrainingOptions
+from gsx.core.training.run import Progress, Run, TrainingOptions
 from gsx.core.training.sampler import Sampler
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.evaluation.eval_options import EvalOptions
@@ -100,8 +100,8 @@ def run_of(folder: Path, photograph: type[Grey] = Grey) -> Run:
         generator=torch.Generator(),
         views=TrainingViews(scene=scene),
         sampler=Sampler(3, 0),
-        step=7,
-        seconds=3.0,
+        progress=Progress(step=7),
+        progress=Progress(seconds=3.0),
     )
 
 

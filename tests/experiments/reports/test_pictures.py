@@ -24,7 +24,7 @@ from gsx.core.training.backbone import DrawnSplats
 from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.render import render
-from gsx.core.training.run import Run, TrainingOptions
+from gsx.core.training.run import Progress, Run, TrainingOptions
 from gsx.core.training.sampler import Sampler
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.evaluation import evaluator
@@ -128,7 +128,7 @@ def make_run(folder: Path, views: int = 3, finest: float = math.inf) -> Run:
         generator=generator,
         views=TrainingViews(scene=scene),
         sampler=Sampler(views, 0),
-        step=10,
+        progress=Progress(step=10),
     )
 
 
