@@ -322,7 +322,7 @@ def test_everything_is_reduced_as_the_scene_says(tmp_path: Path) -> None:
     options = {"coarse_weight": 0.5, "gate": 1.0, "project": "exact", "variants": 0}
     run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper", **options)
     bicubic = Reduction(filter="bicubic")
-    run.scene = replace(run.scene, reduction=bicubic)
+    run.views = replace(run.views, scene=replace(run.scene, reduction=bicubic))
     augmenter = augmenter_of(run)
     augmenter.term(run, 45, 0)
     views = [view for views in augmenter.views.values() for view in views]

@@ -52,7 +52,7 @@ def test_what_is_finer_itself_needs_less(zoom: float, supersample: int, times: i
 def fresh(folder: Path, *more: str) -> Run:
     """A run at step 0 on photographs that are said to have been reduced by the bicubic filter."""
     run = start(tiny_settings(folder, "iterations=40", "rasterizer=eager", *more), plugins())
-    run.scene = replace(run.scene, reduction=BICUBIC)
+    run.views = replace(run.views, scene=replace(run.scene, reduction=BICUBIC))
     run.views = replace(run.views, scene=run.scene)
     return run
 

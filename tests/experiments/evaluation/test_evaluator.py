@@ -100,8 +100,7 @@ def run_of(folder: Path, photograph: type[Grey] = Grey) -> Run:
         generator=torch.Generator(),
         views=TrainingViews(scene=scene),
         sampler=Sampler(3, 0),
-        progress=Progress(step=7),
-        progress=Progress(seconds=3.0),
+        progress=Progress(step=7, seconds=3.0),
     )
 
 

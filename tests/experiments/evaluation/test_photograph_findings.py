@@ -200,7 +200,7 @@ def test_a_test_view_is_drawn_where_its_left_half_was_taken(run: Run) -> None:
     picture = render(run, taken, PIXELS).image.clamp(0, 1)
     scene, lpips = run.scene, LpipsOptions(trunk="", head="", net="vgg", input_range="unit")
     options = EvalOptions(zoom=[1], quantise=True, ssim="inria", tile_pixels=PIXELS, lpips=lpips)
-    run.scene = replace(scene, test=[replace(view, source=Taken(picture))])
+    run.views = replace(run.views, scene=replace(scene, test=[replace(view, source=Taken(picture))]))
     try:
         given = Evaluator(run, options).evaluate()
         aligned = Evaluator(run, replace(options, poses="aligned")).evaluate()
@@ -211,7 +211,7 @@ def test_a_test_view_is_drawn_where_its_left_half_was_taken(run: Run) -> None:
             for shown in (picture, beside)
         ]
     finally:
-        run.scene = scene
+        run.views = replace(run.views, scene=scene)
     assert aligned["psnr"] > given["psnr"] + 3
     assert torch.equal(found[0].rotation, found[1].rotation)
     assert torch.equal(found[0].translation, found[1].translation)

@@ -27,7 +27,7 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Progress, Run, TrainingOptions
 from gsx.core.training.sampler import Sampler
 from gsx.core.training.training_views import TrainingViews
-from gsx.experiments.evaluation import evaluator
+from gsx.experiments.evaluation import evaluated_renders
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.lpips import LpipsOptions
@@ -314,7 +314,7 @@ def test_nothing_is_rendered_or_traced_twice(tmp_path: Path, monkeypatch: pytest
         return plain(self, camera)
 
     plain = Stripes.image
-    monkeypatch.setattr(evaluator, "render", counted)
+    monkeypatch.setattr(evaluated_renders, "render", counted)
     monkeypatch.setattr(Stripes, "image", image)
     run = make_run(tmp_path)
     Evaluator(run, OPTIONS).evaluate(Pictures(tmp_path / "renders", run.step))
