@@ -79,7 +79,8 @@ def gaussians_from(arrays: Arrays) -> Gaussians:
 
 def finite_rows(values: Mapping[str, V], name: str) -> dict[str, V]:
     """Returns the rows that are finite in all values; logs how many others a file of that name has."""
-    finite = np.all([np.isfinite(np.asarray(part)).reshape(len(part), -1).all(1) for part in values.values()], 0)
+    arrays = [np.asarray(part) for part in values.values()]
+    finite = np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], 0)
     if finite.all():
         return dict(values)
     logger.warning("%s: %d of %d splats have values that are not finite, and are left out", name, (~finite).sum(),

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from module_contexts import build_module
 from raster_scenes import SMOOTH, changed, front_camera, gradients, leaves, soft_splats
 from small_scene import published_options, small_gs3d, small_scene, spread
 from tiny import tiny_run, tiny_settings
@@ -19,17 +20,20 @@ from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.resize import display_from_linear, linear_from_display
+from gsx.core.data.scene import Scene
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.training.finer_raster import finer_raster, times_as_fine
 from gsx.core.training.forward import render_for_training
+from gsx.core.training.module import Modules
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
+from gsx.modules.supersampling import Supersampling, SupersamplingOptions
 
 BICUBIC = Reduction(filter="bicubic")
 
@@ -142,12 +146,18 @@ def test_statistics_of_density_control_are_comparable() -> None:
         assert (finer / found[0] - 1).abs().max() < 0.2
 
 
+def supersampling(scene: Scene, factor: int, start: float, iterations: int = 1000) -> Modules:
+    """Finer renders from a share of the steps on."""
+    options = SupersamplingOptions(factor=factor, start=start)
+    return {"supersampling": build_module(Supersampling, options, iterations=iterations, scene=scene)}
+
+
 def test_the_3d_filter_is_that_of_finer_cameras_and_the_zoomed_rule_that_of_photographs() -> None:
     scene = small_scene(spread(30))
     for name in ("mip", "resampled"):
         options = replace(published_options(), filter=name)
         one = small_gs3d(scene, options=options)
-        two = small_gs3d(scene, options=options, supersample=2)
+        two = small_gs3d(scene, options=options, modules=supersampling(scene, 2, 0.0))
         assert one.raster == two.raster
         if name == "mip":
             assert torch.allclose(2 * two.table["filter"], one.table["filter"])
@@ -164,7 +174,7 @@ def test_pictures_go_on_as_they_were_where_renders_become_finer() -> None:
     assert torch.allclose(table["log_scales"].exp(), torch.tensor(0.02))
     assert torch.allclose(table["opacity_logits"].sigmoid(), torch.tensor(0.05), rtol=1e-4)
     scene, options = small_scene(spread(40)), replace(published_options(), filter="mip")
-    model = small_gs3d(scene, options=options, iterations=100, supersample=2, finer_after=60)
+    model = small_gs3d(scene, options=options, iterations=100, modules=supersampling(scene, 2, 0.6, iterations=100))
     camera = scene.train[0].camera
     before, sizes = model.draw(camera, 60).splats, model.table["filter"].clone()
     model.densify_and_prune(60)
@@ -193,7 +203,7 @@ def test_it_is_evaluated_as_it_was_trained_unless_told(tmp_path: Path) -> None:
     view = whole.scene.test[0]
     for asked, times in ((0, 2), (1, 1), (4, 4)):
         run, settings = open_run(tmp_path / "whole", plugins(), [f"eval.supersample={asked}"])
-        picture = Evaluator(run, settings.evaluation).render_for_training(view).image
+        picture = Evaluator(run, settings.evaluation).renders.render(view).image
         drawn = run.backbone.draw(view.camera, run.model_step).splats
         fine = rasterize(drawn, view.camera.zoom(times), run.raster, background=run.background).image.detach()
         assert (picture - avg_pool2d(fine, times).clamp(0, 1)).abs().max() <= 1e-5

@@ -45,9 +45,9 @@ def odd_camera(scene: Scene) -> Scene:
         (lambda scene: replace(scene, test=scene.train[3:]), "with 'view3' to train on and to test on"),
         (
             lambda scene: replace(scene, background=torch.full((3,), 255.0)),
-            r"background is \[255.0, 255.0, 255.0\]: give",
+            r"background of \[255.0, 255.0, 255.0\]: give",
         ),
-        (lambda scene: replace(scene, background=torch.zeros(1)), r"background is \[0.0\]: give"),
+        (lambda scene: replace(scene, background=torch.zeros(1)), r"background of \[0.0\]: give"),
         (
             lambda scene: replace(scene, points=replace(scene.points, positions=scene.points.positions * math.nan)),
             "points that are not finite",
