@@ -42,10 +42,7 @@ class Telling:
     "told", [{"grows every": 4, "until": [1.5, 20]}, {"mine": {"grows every": 4, "until": [1.5, 20]}}]
 )
 def test_a_plan_may_have_parts_or_none(told: dict[str, Any]) -> None:
-    plateau = SimpleNamespace(plan=dict)
-    run: Any = SimpleNamespace(
-        config={"backbone": {"name": "mine"}}, backbone=Telling(told), plateau=plateau, augmenters=[]
-    )
+    run: Any = SimpleNamespace(config={"backbone": {"name": "mine"}}, backbone=Telling(told), modules={}, augmenters={})
     assert plan_of(run) == {"mine": {"grows every": 4, "until": [1.5, 20]}}
     assert [in_words(value) for value in (4, 0.25, [1.5, 20], [], True, "soon", None)] == [
         *("4", "0.25", "1.5 20", "none", "1", "soon", "None")
