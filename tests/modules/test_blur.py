@@ -134,7 +134,7 @@ def moved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Path]:
 def test_a_run_finds_how_its_cameras_moved(moved: tuple[Run, Path]) -> None:
     run, _ = moved
     told = [line for line in run.progress.curves if "blur_seconds" in line]
-    assert [line["step"] for line in told] == run.modules["blur"].steps()
+    assert [line["step"] for line in told] == run.modules["blur"].milestones()
     module = run.modules["blur"]
     remarks = " ".join(module.remarks(module.summary(run.progress.curves)))
     assert f"moved in {len(module.movements)} training photos" in remarks

@@ -256,7 +256,7 @@ def test_a_stop_while_distractors_are_found_leaves_all_to_be_found_again(
     module = run.modules["distractors"]
     before = module.masks, module.last_estimate
 
-    def stop(*_: object) -> None:
+    def stop(**_: object) -> None:
         raise Stopped
 
     blocks = [torch.ones(9, 12, dtype=torch.bool) for _ in run.scene.train]
