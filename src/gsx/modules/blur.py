@@ -57,6 +57,7 @@ class Blur(Correction):
 
     options: BlurOptions
     seconds_key = "blur_seconds"
+    figures_key = "blur"
 
     def __init__(self, options: BlurOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
@@ -139,14 +140,11 @@ class Blur(Correction):
         self.last_estimate = int(tensors["asked"]) if tensors else 0
 
     @classmethod
-    def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    def figures(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """Returns when movements were estimated first, and of how many photos at last."""
-        held = [line for line in lines if cls.seconds_key in line]
-        if not held:
-            return {}
-        figures = {"step": held[0]["step"], "blurred": held[-1]["blurred"], "asked": held[-1]["blur_suspects"]}
-        figures |= {"length": held[-1].get("blur_length", 0.0), "seconds": sum(line[cls.seconds_key] for line in held)}
-        return {"blur": figures}
+        first, last = lines[0], lines[-1]
+        counts = {"step": first["step"], "blurred": last["blurred"], "asked": last["blur_suspects"]}
+        return counts | {"length": last.get("blur_length", 0.0)}
 
     @classmethod
     def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:

@@ -1,19 +1,20 @@
 """Corrections of photos: when they are estimated, and what their options have in common."""
 
+import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import torch
 
 from gsx.core.data.scene import View
 from gsx.core.ranges import Range, Share
 from gsx.core.seeds import derived_seed
-from gsx.core.training.module import TrainingModule
+from gsx.core.training.module import ModuleContext, TrainingModule
+from gsx.core.training.run import Run
 
-if TYPE_CHECKING:
-    from gsx.core.training.run import Run
+logger = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
 WHEN = ("never", "auto", "always")
@@ -61,6 +62,8 @@ class Correction(TrainingModule):
     options: CorrectionOptions
     seconds_key: ClassVar[str]
     """Key of the time that an estimate takes, in metrics.jsonl."""
+    figures_key: ClassVar[str]
+    """Key of its figures in evaluation.json."""
     last_estimate = 0
     """Step before which it was estimated last: a step that is taken again does not estimate again."""
 
@@ -69,11 +72,11 @@ class Correction(TrainingModule):
         """Whether photos are corrected now."""
         raise NotImplementedError
 
-    def estimate(self, run: "Run", step: int) -> dict[str, float]:
+    def estimate(self, run: Run, step: int) -> dict[str, float]:
         """Test and estimate before a step; returns metrics for its line."""
         raise NotImplementedError
 
-    def before_step(self, run: "Run") -> dict[str, float]:
+    def before_step(self, run: Run) -> dict[str, float]:
         """Estimate the correction if it is due before the next step."""
         step = run.step + 1
         if not self.due(step):
@@ -94,6 +97,24 @@ class Correction(TrainingModule):
     def supports(self, ranks: int) -> bool:
         """Returns whether it is off or one process trains: ranks do not estimate together."""
         return ranks == 1 or self.options.when == "never"
+
+    def restarted(self, context: ModuleContext) -> TrainingModule:
+        """Returns the module for another run; it corrects nothing where that run's views are corrected already."""
+        return type(self)(type(self.options)() if self.in_views else self.options, context)
+
+    @classmethod
+    def figures(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Returns figures for evaluation.json from the lines of its estimates, at least one."""
+        raise NotImplementedError
+
+    @classmethod
+    def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Returns the figures of its estimates and the seconds that they took; a stop before a step loses its line."""
+        estimates = [line for line in lines if cls.seconds_key in line]
+        if not estimates:
+            return {}
+        seconds = sum(line[cls.seconds_key] for line in estimates)
+        return {cls.figures_key: cls.figures(estimates) | {"seconds": seconds}}
 
 
 @dataclass(eq=False)
@@ -116,3 +137,14 @@ def sample(items: Sequence[Item], count: int, purpose: str) -> list[Item]:
     generator = torch.Generator().manual_seed(derived_seed(purpose))
     order = torch.randperm(len(items), generator=generator)[:count]
     return [items[index] for index in order.tolist()]
+
+
+def log_test(step: int, what: str, value: float, threshold: float, show: Callable[[float], str], verdict: str) -> None:
+    """Log a test before a step: its value, the threshold, and what follows; show: writes both with their unit."""
+    sign = ">" if value > threshold else "<="
+    logger.info("step %d: %s %s %s %s, %s", step, what, show(value), sign, show(threshold), verdict)
+
+
+def percent(share: float) -> str:
+    """Writes a share in percent."""
+    return f"{100 * share:.1f} %"

@@ -22,7 +22,16 @@ from gsx.core.training.module import ModuleContext
 from gsx.core.training.parameter_table import keep_rows
 from gsx.core.training.run import Run
 from gsx.modules.coarser import CoarseSource, coarser
-from gsx.modules.corrections import Correction, CorrectionOptions, Times, ViewCache, ViewCount, sample
+from gsx.modules.corrections import (
+    Correction,
+    CorrectionOptions,
+    Times,
+    ViewCache,
+    ViewCount,
+    log_test,
+    percent,
+    sample,
+)
 from gsx.modules.distractor_masks import Difference, difference_of, distractors_in
 from gsx.modules.photo_pairs import REDUCTION, gains, match_brightness, render_reduced
 
@@ -51,6 +60,8 @@ class Distractors(Correction):
 
     options: DistractorOptions
     seconds_key = "distractor_seconds"
+    figures_key = "distractors"
+    in_views = True
 
     def __init__(self, options: DistractorOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
@@ -62,10 +73,6 @@ class Distractors(Correction):
     def active(self) -> bool:
         """Whether photos are masked."""
         return self.masks is not None
-
-    def restarted(self, context: ModuleContext) -> "Distractors":
-        """Returns a module that masks nothing: the other run gets masked views."""
-        return Distractors(DistractorOptions(), context)
 
     def transform_views(self, views: Sequence[View], step: int | None) -> Sequence[View]:
         """Returns the views without their distractors."""
@@ -88,7 +95,8 @@ class Distractors(Correction):
             share = mean_share(distractors_in(list(differences.values())))
             needed = self.options.when == "always" or share > self.options.share
             metrics["distractor_share"] = share
-            log_test(step, share, self.options.share, needed)
+            verdict = "masking photos" if needed else "all pixels count"
+            log_test(step, "distractors", share, self.options.share, percent, verdict)
         if needed:
             differences |= measure_differences(run, [view for view in views if view not in differences])
         masks = distractors_in([differences[view] for view in views]) if needed else None
@@ -122,19 +130,11 @@ class Distractors(Correction):
         self.mask(masks, int(tensors["looked"]) if tensors else 0)
 
     @classmethod
-    def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """Returns when photos were tested, the share that the test found, and the masked shares since.
-
-        A stop before the step was taken loses its line.
-        """
-        held = [line for line in lines if cls.seconds_key in line]
-        if not held:
-            return {}
-        masked = [line["distractors"] for line in held] if any(line["distractors"] for line in held) else []
-        shares = [line["distractor_share"] for line in held if "distractor_share" in line]
-        seconds = sum(line[cls.seconds_key] for line in held)
-        figures = {"step": held[0]["step"], "share": (shares or [None])[0], "marked": masked, "seconds": seconds}
-        return {"distractors": figures}
+    def figures(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Returns when photos were tested, the share that the test found, and the masked shares since."""
+        masked = [line["distractors"] for line in lines] if any(line["distractors"] for line in lines) else []
+        shares = [line["distractor_share"] for line in lines if "distractor_share" in line]
+        return {"step": lines[0]["step"], "share": (shares or [None])[0], "marked": masked}
 
     @classmethod
     def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
@@ -145,12 +145,6 @@ class Distractors(Correction):
                 f"{figures['marked'][-1]:.1%} of the pixels of training photos show what others do not, and do not "
                 f"count from step {figures['step']:,} on"
             )
-
-
-def log_test(step: int, share: float, threshold: float, needed: bool) -> None:
-    """Log the share of pixels that show distractors, and what follows."""
-    sign, verdict = ">" if share > threshold else "<=", "masking photos" if needed else "all pixels count"
-    logger.info("step %d: distractors %.1f %% %s %.1f %%, %s", step, 100 * share, sign, 100 * threshold, verdict)
 
 
 def measure_differences(run: Run, views: Sequence[View]) -> dict[View, Difference]:

@@ -26,7 +26,7 @@ from gsx.core.training.module import ModuleContext
 from gsx.core.training.run import Run
 from gsx.core.training.schedule import log_linear
 from gsx.modules.bilateral_grid import WHOLE, apply_grid, initial_grids, light_slopes, without_common
-from gsx.modules.corrections import WHEN, Correction, CorrectionOptions, ViewCount, sample
+from gsx.modules.corrections import WHEN, Correction, CorrectionOptions, ViewCount, log_test, percent, sample
 from gsx.modules.photo_pairs import LIGHT, Pair, log_gains, render_reduced, shared_spread, usable_pixels
 
 logger = logging.getLogger(__name__)
@@ -34,6 +34,7 @@ logger = logging.getLogger(__name__)
 PositiveRate = Annotated[float, Range(1e-9, 1)]
 BETAS, EPS = (0.9, 0.99), 1e-8
 """Of Adam; a short run visits a photo a few dozen times."""
+EQUAL = "photos are taken as equal"
 MIN_BLOCK_PIXELS = 16
 """Fewest usable pixels of a block of a photo."""
 
@@ -122,6 +123,7 @@ class Exposure(Correction):
 
     options: ExposureOptions
     seconds_key = "exposure_seconds"
+    figures_key = "exposures"
 
     def __init__(self, options: ExposureOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
@@ -159,7 +161,7 @@ class Exposure(Correction):
             return light_of(photo_pair(run, views[index]), slopes=not self.active and self.options.grid != "never")
 
         if not self.active:
-            return log_test(self, step, *self.test(measure, step))
+            return log_tests(self, step, *self.test(measure, step))
         change = self.correct(measure, step)
         logger.info("step %d: exposures re-estimated, RMS change %.1f %%", step, 100 * change)
         return {"exposures": self.count, "exposure_motion": change}
@@ -287,17 +289,12 @@ class Exposure(Correction):
             self.grid_moments = tensors["grid_moments"].to(self.context.device).clone()
 
     @classmethod
-    def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    def figures(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """Returns when photos were tested, the spreads, how many are corrected, and the changes since."""
-        held = [line for line in lines if cls.seconds_key in line]
-        if not held:
-            return {}
-        first = held[0]
+        first, motions = lines[0], [line["exposure_motion"] for line in lines if "exposure_motion" in line]
         figures = {"step": first["step"], "spread": first.get("exposure_spread"), "learnt": first["exposures"]}
-        figures["motions"] = [line["exposure_motion"] for line in held if "exposure_motion" in line]
-        figures["seconds"] = sum(line[cls.seconds_key] for line in held)
         grids = {"within": first["light_spread"], "grids": first["grids"]} if "light_spread" in first else {}
-        return {"exposures": figures | grids}
+        return figures | {"motions": motions} | grids
 
     @classmethod
     def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
@@ -327,22 +324,17 @@ def photo_pair(run: Run, view: View) -> Pair:
     return image, small.image(), below if mask is None else below & mask
 
 
-def log_test(module: Exposure, step: int, spread: float, within: float) -> dict[str, float]:
+def log_tests(module: Exposure, step: int, spread: float, within: float) -> dict[str, float]:
     """Log the spreads that a test measured and what follows; returns them for the line of the step."""
     options, active, grids = module.options, module.active, module.grids is not None
-    log_verdict(step, "exposure spread", spread, options.spread, "learning one per photo", active)
+    verdict = "learning one per photo" if active else EQUAL
+    log_test(step, "exposure spread", spread, options.spread, percent, verdict)
     metrics = {"exposure_spread": spread, "exposures": module.count if active else 0}
     if math.isnan(within):
         return metrics
-    log_verdict(step, "light spread within photos", within, options.grid_spread, "learning grids", grids)
+    verdict = "learning grids" if grids else EQUAL
+    log_test(step, "light spread within photos", within, options.grid_spread, percent, verdict)
     return metrics | {"light_spread": within, "grids": module.count if grids else 0}
-
-
-def log_verdict(step: int, what: str, value: float, threshold: float, action: str, active: bool) -> None:
-    """Log a test of a spread: its value, the threshold, and what follows."""
-    verdict = action if active else "photos are taken as equal"
-    sign = ">" if value > threshold else "<="
-    logger.info("step %d: %s %.1f %% %s %.1f %%, %s", step, what, 100 * value, sign, 100 * threshold, verdict)
 
 
 def adam_direction(moments: Float[Tensor, "2 *S"], gradient: Float[Tensor, "*S"], steps: float) -> Float[Tensor, "*S"]:

@@ -27,7 +27,7 @@ from gsx.core.training.run import Run
 from gsx.formats.turned import cross_matrix
 from gsx.modules.alignment import Motion, aligned, motion_to, rotation_by, usual_depth
 from gsx.modules.coarser import coarser
-from gsx.modules.corrections import Correction, CorrectionOptions, Times, ViewCache, ViewCount, sample
+from gsx.modules.corrections import Correction, CorrectionOptions, Times, ViewCache, ViewCount, log_test, sample
 from gsx.modules.photo_pairs import REDUCTION, render_reduced, shared_spread
 from gsx.modules.pinned import posed
 from gsx.modules.shifts import shift_of
@@ -62,6 +62,8 @@ class Poses(Correction):
 
     options: PoseOptions
     seconds_key = "pose_seconds"
+    figures_key = "poses"
+    in_views = True
 
     def __init__(self, options: PoseOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
@@ -75,10 +77,6 @@ class Poses(Correction):
     def active(self) -> bool:
         """Whether poses are corrected."""
         return self.matrices is not None
-
-    def restarted(self, context: ModuleContext) -> "Poses":
-        """Returns a module that corrects nothing: the other run gets views with corrected poses."""
-        return Poses(PoseOptions(), context)
 
     def transform_views(self, views: Sequence[View], step: int | None) -> Sequence[View]:
         """Returns the views with corrected poses."""
@@ -103,10 +101,9 @@ class Poses(Correction):
 
     def wrong(self, spread: float, step: int) -> bool:
         """Returns whether poses need correction, by the spread of shifts, px; logs it."""
-        above = spread > self.options.spread
-        wrong = above or self.options.when == "always"
-        sign, verdict = ">" if above else "<=", "refining poses" if wrong else "poses kept"
-        logger.info("step %d: pose error %.2f px %s %.2f px, %s", step, spread, sign, self.options.spread, verdict)
+        wrong = spread > self.options.spread or self.options.when == "always"
+        verdict = "refining poses" if wrong else "poses kept"
+        log_test(step, "pose error", spread, self.options.spread, "{:.2f} px".format, verdict)
         return wrong
 
     def align(self, run: Run, views: Sequence[View], usual: float, step: int) -> float:
@@ -172,14 +169,11 @@ class Poses(Correction):
         self.error = float(tensors.get("error", math.nan))  # older checkpoints lack it
 
     @classmethod
-    def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    def figures(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """Returns when poses were tested, the spread of shifts, how many are corrected, and the motions."""
-        held = [line for line in lines if cls.seconds_key in line]
-        if not held:
-            return {}
-        figures = {"step": held[0]["step"], "spread": held[0].get("pose_spread"), "corrected": held[0]["poses"]}
-        figures["motions"] = [line["pose_motion"] for line in held if "pose_motion" in line]
-        return {"poses": figures | {"seconds": sum(line[cls.seconds_key] for line in held)}}
+        first, motions = lines[0], [line["pose_motion"] for line in lines if "pose_motion" in line]
+        tested = {"step": first["step"], "spread": first.get("pose_spread"), "corrected": first["poses"]}
+        return tested | {"motions": motions}
 
     @classmethod
     def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:

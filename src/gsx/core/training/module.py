@@ -7,7 +7,7 @@ a default that changes nothing. A module draws no numbers from `run.generator`.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -37,6 +37,8 @@ class ModuleContext:
 class TrainingModule:
     """A part of training beside the model; a subclass overrides the hooks that it needs."""
 
+    in_views: ClassVar[bool] = False
+    """Whether views that another run gets from this one have its corrections, which `restarted` must not repeat."""
     skipped = range(0)
     """Steps that it skipped."""
 

@@ -22,8 +22,6 @@ ONE_IN = 8
 """One of this many training views validates."""
 FEWEST = 2
 """Fewest validation views; of fewer than three training views all validate, and all are learnt from."""
-CORRECTED = ("poses", "distractors")
-"""Modules whose corrections the views of a copied run already have."""
 BANDS = (0, 3, 8, 15)
 """Coefficients beside the constant one, by degree of colour."""
 
@@ -52,11 +50,12 @@ def shared_by_copies(run: Run) -> dict[int, object]:
 
 def modules_for(run: Run, scene: Scene) -> Modules:
     """Copies a run's modules for a scene whose training views have their corrections."""
-    context = replace(run.modules["poses"].context, scene=scene)
-    others = {name: module for name, module in run.modules.items() if name not in CORRECTED}
+    others = {name: module for name, module in run.modules.items() if not module.in_views}
     copies = copy.deepcopy(others, shared_by_copies(run))
-    restarted = {name: run.modules[name].restarted(replace(context, name=name)) for name in CORRECTED}
-    return {name: (copies | restarted)[name] for name in run.modules}
+    return {
+        name: module.restarted(replace(module.context, scene=scene)) if module.in_views else copies[name]
+        for name, module in run.modules.items()
+    }
 
 
 def fine_tuned(run: Run, views: Sequence[View], degree: int, steps: int, plugins: Plugins) -> Run:
@@ -71,7 +70,7 @@ def fine_tuned(run: Run, views: Sequence[View], degree: int, steps: int, plugins
         for _ in range(steps):
             train_step(learner, plugins)
             cut_bands(learner.backbone.table, degree)
-    modules = {name: (run if name in CORRECTED else learner).modules[name] for name in run.modules}
+    modules = {name: module if module.in_views else learner.modules[name] for name, module in run.modules.items()}
     return replace(run, backbone=learner.backbone, views=replace(run.views, modules=modules))
 
 

@@ -77,8 +77,10 @@ def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
     scene = replace(run.scene, train=views, test=[])
     own = derived_seed("halves", seed, run.step, half)
     generator = torch.Generator().manual_seed(own)
-    contexts = {name: replace(module.context, scene=scene, iterations=steps) for name, module in run.modules.items()}
-    modules = {name: module.restarted(contexts[name]) for name, module in run.modules.items()}
+    modules = {
+        name: module.restarted(replace(module.context, scene=scene, iterations=steps))
+        for name, module in run.modules.items()
+    }
     training_views = TrainingViews(scene=scene, modules=modules)
     backbone = anew(scene, steps, generator, training_views)
     return Run(
