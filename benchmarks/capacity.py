@@ -1,4 +1,4 @@
-"""How many primitives a scene needs: published growth, budgets, and growth that pays for itself (docs/capacity.md).
+"""Measure how many primitives a scene needs: published, budgeted and adaptive growth (docs/explanation/capacity.md).
 
     python benchmarks/capacity.py [--scenes FOLDER] [--what growth,compact] [--only fox,lego] [--backbones gs3d]
 

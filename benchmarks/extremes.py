@@ -1,4 +1,4 @@
-"""Measure every case of the extremes suite and write the table into docs/numerics.md.
+"""Measure every case of the extremes suite and write the table into docs/explanation/numerics.md.
 
     python benchmarks/extremes.py
 
@@ -17,7 +17,7 @@ from extremes.cases import CASES, Case, scientific  # type: ignore[import-not-fo
 from extremes.comparison import measure, paths  # type: ignore[import-not-found]  # noqa: E402
 from extremes.table import COLUMNS, PATHS, rewritten  # type: ignore[import-not-found]  # noqa: E402
 
-PAGE = ROOT / "docs" / "numerics.md"
+PAGE = ROOT / "docs" / "explanation" / "numerics.md"
 
 
 def worst(case: Case, path: str) -> tuple[float, float]:

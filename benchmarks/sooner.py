@@ -1,4 +1,4 @@
-"""How soon a model is good: what plain `gsx` trains, in fewer steps, beside published 3D-GS (docs/capacity.md).
+"""Compare the default in fewer steps with published 3D-GS (docs/explanation/capacity.md).
 
     python benchmarks/sooner.py [--scenes FOLDER] [--only demo,room,fox_4] [--seeds 0,1,2] [--jobs 2]
 

@@ -1,4 +1,4 @@
-"""Where a model starts, and how it grows, in rooms: points where there is pattern, or more (docs/capacity.md).
+"""Compare starting points and growth in rooms with plain walls (docs/explanation/capacity.md).
 
     python benchmarks/starts.py [--scenes FOLDER] [--only room,castle] [--seeds 0,1,2] [--jobs 2]
 

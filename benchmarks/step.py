@@ -1,4 +1,4 @@
-"""Where a training step's time goes, stage by stage, and whether a stage has become slower (docs/decisions.md).
+"""Time a training step by stage and compare it with another revision (docs/explanation/decisions.md).
 
     python benchmarks/step.py [--backbones gs3d,octree_scaffold]
     python benchmarks/step.py --scene fox --scenes FOLDER

@@ -1,4 +1,4 @@
-"""What settings cost and bring: of a training on several scenes, and of the rasterizer (docs/trade-offs.md).
+"""Measure what settings of training and of the rasterizer cost and bring (docs/how-to/choose-settings.md).
 
     python benchmarks/trades.py [--scenes FOLDER] [--only demo,fox,lego] [--seeds 0,1] [--jobs 2]
     python benchmarks/trades.py --what rasterizer [--run RUN] [rasterizer.KEY=VALUE ...]
@@ -33,7 +33,7 @@ from measuring.runs import train
 from measuring.watches import Patience
 from zoom import shared_arguments, steps_among, told
 
-PAGE = Path(__file__).parents[1] / "docs" / "trade-offs.md"
+PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "choose-settings.md"
 TITLES = {"demo": "The built-in scene", "fox": "fox, an eighth", "lego": "lego, a quarter"}
 HALF, TWICE = "half the steps", "twice the steps"
 TRADES: dict[str, dict[str, tuple[str, ...]]] = {
@@ -213,7 +213,7 @@ def trade_training(given: argparse.Namespace, command: str) -> None:
 
 
 def page(text: str, sections: Mapping[str, Section]) -> str:
-    """docs/trade-offs.md with its tables anew: each stands below a comment that names its scene, up to a blank line."""
+    """Replace the tables of the page: each follows a comment that names its scene, up to a blank line."""
     for scene, section in sections.items():
         mark = f"<!-- {scene}: written by benchmarks/trades.py -->\n"
         before, after = text.split(mark)

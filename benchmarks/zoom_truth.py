@@ -1,4 +1,4 @@
-"""What helps when looking closer, on held-out true pixels: `gsx +experiment=zoom_truth` seed by seed, for docs/zoom.md.
+"""Run `gsx +experiment=zoom_truth` for several seeds and tabulate it (docs/explanation/zooming.md).
 
     python benchmarks/zoom_truth.py --scenes FOLDER [--only fox,lego] [--seeds 0,1,2] [--rows zoom,...] [--jobs 2]
 

@@ -1,10 +1,13 @@
 """Hooks of mkdocs: the index is README.md, the page of the configuration is made from conf/."""
 
+import os
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 from gsx.builtin import plugins
 from gsx.experiments.runs.explain import reference
@@ -15,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages that lie elsewhere or nowhere."""
     files.append(File.generated(config, "index.md", content=index()))
-    files.append(File.generated(config, "configuration.md", content="\n".join(reference(plugins()))))
+    files.append(File.generated(config, "reference/configuration.md", content="\n".join(reference(plugins()))))
     return files
 
 
@@ -25,14 +28,23 @@ def index() -> str:
     return re.sub(r"\]\((?!https?:|#)(?:docs/)?", "](", re.sub(r"\]\((?!docs/|https?:|#)", "](../", text))
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Files outside of docs/ are named, since the site does not hold them: [text](../file) becomes text (`file`)."""
-    return re.sub(r"!?\[([^\]]*)\]\(\.\./([^)]+)\)", outside, markdown)
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    """Name files outside of docs/, which the site does not hold: [text](../../file) becomes text (`file`)."""
+    folder = (ROOT / "docs" / page.file.src_uri).parent
+    return re.sub(r"!?\[([^\]]*)\]\(((?:\.\./)+[^)]+)\)", partial(in_words, folder), markdown)
 
 
-def outside(link: re.Match[str]) -> str:
-    """A link to a file of the repository, in words."""
+def in_words(folder: Path, link: re.Match[str]) -> str:
+    """Replace a link to a file of the repository outside of docs/ by words; keep others.
+
+    Raises:
+        ValueError: there is no such file.
+    """
     text, target = link.groups()
-    if not (ROOT / target.partition("#")[0]).exists():
+    file = Path(os.path.normpath(folder / target.partition("#")[0]))
+    if file.is_relative_to(ROOT / "docs"):
+        return link[0]
+    if not file.exists():
         raise ValueError(f"'{target}' is no file of the repository")
-    return f"`{target}`" if text.strip("`") in target else f"{text} (`{target}`)"
+    name = str(file.relative_to(ROOT))
+    return f"`{name}`" if text.strip("`") in name else f"{text} (`{name}`)"

@@ -185,7 +185,7 @@ def test_names_are_there_before_torch_is() -> None:
 def test_the_page_does_what_it_says(
     run: gsx.TrainedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = (Path(__file__).parents[1] / "docs" / "python.md").read_text()
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "python.md").read_text()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(gsx, "train", lambda *_, **__: run, raising=False)  # trained above
     exec(page.split("```python\n")[1].split("```")[0], names := {})

@@ -1,35 +1,84 @@
-"""Documentation that can be wrong is tested: hooks, files named, commands of the README."""
+"""Checks what pages say: links, anchors, files they name, hooks, commands; and that no page is left out."""
 
 import inspect
+import os
 import re
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
 import pytest
+from pages import DOCS, LINK, NAMES, PAGES, RESULTS, ROOT, anchors
 
 from gsx.core.plugins import Hooks
 
-ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SKIPPED = {".venv", ".git", "build", "dist", "outputs", "multirun", "node_modules"}
+SOURCES = ("src", "conf", "benchmarks", "tests", "scripts", "examples")
+
+
+GENERATED = {DOCS / "reference" / name for name in ("cli.md", "configuration.md", "api.md")}
+"""Pages that scripts/site.py makes."""
+
+
+def files_below(folder: Path, *suffixes: str) -> Iterator[Path]:
+    """Yield files with these suffixes, without those of tools and runs."""
+    for path, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if name not in SKIPPED and not name.startswith(".")]
+        yield from (Path(path) / name for name in names if name.endswith(suffixes))
+
+
+def test_no_page_is_left_out() -> None:
+    """A page that no test reads could say anything."""
+    known = {*PAGES, *RESULTS.rglob("*.md")}
+    assert not {str(page.relative_to(ROOT)) for page in files_below(ROOT, ".md") if page not in known}
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    named = set(re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2]))
+    assert {str(page.relative_to(DOCS)) for page in PAGES if page.is_relative_to(DOCS)} <= named
+
+
+def test_pages_that_code_names_exist() -> None:
+    """Docstrings, messages, settings and tests name pages below docs, some with an anchor."""
+    missing, references = [], 0
+    for file in [
+        *(f for folder in SOURCES for f in files_below(ROOT / folder, ".py", ".yaml", ".sh")),
+        ROOT / "Makefile",
+    ]:
+        for name, anchor in re.findall(r"\b(docs/[\w/-]+\.md)(?:#([\w-]+))?", file.read_text(errors="ignore")):
+            references += 1
+            page = ROOT / name
+            if not page.is_file() or (anchor and anchor not in anchors(page)):
+                missing.append(f"{file.relative_to(ROOT)}: {name}{'#' + anchor if anchor else ''}")
+    assert not [line for line in missing if "viewer_page.py" not in line]  # a page of the viewer's own project
+    assert references > 50
 
 
 def test_every_hook_is_documented_with_its_arguments() -> None:
-    text = (ROOT / "docs" / "writing-plugins.md").read_text()
+    text = (ROOT / "docs" / "how-to" / "write-a-plugin.md").read_text()
     for name, hook in inspect.getmembers(Hooks, inspect.isfunction):
         arguments = ", ".join(list(inspect.signature(hook).parameters)[1:])
         assert f"`{name}({arguments})`" in text, name
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_links_between_pages_lead_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text()):
-        assert (page.parent / target).exists(), target
+    """Pages that are generated for the site alone count as there."""
+    for target, anchor in LINK.findall(page.read_text()):
+        file = (page.parent / target).resolve() if target else page
+        if file in GENERATED:
+            continue
+        assert file.exists(), target
+        assert not anchor or anchor in anchors(file), f"{target}#{anchor}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_source_files_named_in_backticks_exist(page: Path) -> None:
     for name in re.findall(r"`((?:src|conf|tests|examples|docs)/[\w./-]+)`", page.read_text()):
         assert (ROOT / name).exists(), name
+
+
+WITH_COMMANDS = [page for page in PAGES if "```sh" in page.read_text()]
 
 
 @cache
@@ -41,7 +90,9 @@ def composed(words: tuple[str, ...]) -> None:
     compose(words, plugins())
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if "```sh" in page.read_text()], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if "```sh" in page.read_text()], ids=lambda page: str(page.relative_to(ROOT))
+)
 def test_commands_of_pages_are_accepted(page: Path) -> None:
     from gsx.cli.dispatch import VERBS
 
@@ -60,11 +111,11 @@ def test_the_commands_of_the_readme_are_found() -> None:
 
 
 def test_keys_named_for_those_who_come_from_elsewhere_exist() -> None:
-    """In docs/coming-from.md: `a.b.c` is a key of some composition, words after it are its neighbours."""
+    """In docs/how-to/migrate.md: `a.b.c` is a key of some composition, words after it are its neighbours."""
     from gsx.builtin import plugins
     from gsx.experiments.runs.compose import Compositions, listed
 
-    text = (ROOT / "docs" / "coming-from.md").read_text()
+    text = (ROOT / "docs" / "how-to" / "migrate.md").read_text()
     with Compositions(plugins()) as compositions:
         words = [
             ["scene=blender"],

@@ -9,10 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
-NAMES = [page.name for page in PAGES]
+from pages import NAMES, PAGES, ROOT
 
 NUMBER = r"(?<![\w.])(?:(?<!\d)[-+])?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[-+]?\d+)?(?!\w|\.\d)"
 UNIT = r"dB|ms|s|seconds?|min|minutes?|hours?|MB|GB|GB/s|renders/s|steps/s|it/s|%"
@@ -26,20 +23,24 @@ GENERATED = re.compile(r"<!-- \w+: written by (\S+) -->\n")
 
 NO_MEASUREMENTS: list[tuple[str, str, str]] = [
     # page, words, why they are no measurement
-    ("augmenters.md", "from 55 % of the run on", "conf/augmenter/upscale_paper.yaml: the paper's start"),
-    ("augmenters.md", "from 50 % of the run on", "conf/augmenter/bootstrap.yaml: the paper's start"),
-    ("augmenters.md", "from 20 % on", "conf/augmenter/bootstrap_original.yaml: the start of Bootstrap-GS"),
-    ("augmenters.md", "reconstructs to some 23 dB", "published for kl-f8: 23.4 +- 3.8 dB on ImageNet"),
-    ("clusters.md", "30 seconds later", "torchrun's own patience"),
-    ("numerics.md", "at most 1 % of a picture", "a bound of tests/extremes"),
-    ("regenerators.md", "2.3 GB | 3 GB", "estimates from numbers of parameters, as the page says"),
-    ("regenerators.md", "3.5 GB | 5 GB", "the same"),
-    ("regenerators.md", "5.8 GB | 8 GB", "the same"),
-    ("regenerators.md", "6.9 GB | 12 to 16 GB", "the same"),
-    ("regenerators.md", "6.9 GB | 9 GB", "the same"),
-    ("regenerators.md", "files (a) | memory (a)", "the same"),
-    ("regenerators.md", "further than 25 dB from", "an example of an option"),
-    ("tables.md", "weights of some 10 GB", "the sum of files in docs/regenerators.md"),
+    ("docs/reference/augmenters.md", "from 55 % of the run on", "conf/augmenter/upscale_paper.yaml: the paper's start"),
+    ("docs/reference/augmenters.md", "from 50 % of the run on", "conf/augmenter/bootstrap.yaml: the paper's start"),
+    (
+        "docs/reference/augmenters.md",
+        "from 20 % on",
+        "conf/augmenter/bootstrap_original.yaml: the start of Bootstrap-GS",
+    ),
+    ("docs/reference/augmenters.md", "reconstructs to some 23 dB", "published for kl-f8: 23.4 +- 3.8 dB on ImageNet"),
+    ("docs/how-to/sweeps-and-clusters.md", "30 seconds later", "torchrun's own patience"),
+    ("docs/explanation/numerics.md", "at most 1 % of a picture", "a bound of tests/extremes"),
+    ("docs/reference/regenerators.md", "2.3 GB | 3 GB", "estimates from numbers of parameters, as the page says"),
+    ("docs/reference/regenerators.md", "3.5 GB | 5 GB", "the same"),
+    ("docs/reference/regenerators.md", "5.8 GB | 8 GB", "the same"),
+    ("docs/reference/regenerators.md", "6.9 GB | 12 to 16 GB", "the same"),
+    ("docs/reference/regenerators.md", "6.9 GB | 9 GB", "the same"),
+    ("docs/reference/regenerators.md", "files (a) | memory (a)", "the same"),
+    ("docs/reference/regenerators.md", "further than 25 dB from", "an example of an option"),
+    ("docs/how-to/reproduce-tables.md", "weights of some 10 GB", "the sum of files in docs/reference/regenerators.md"),
 ]
 """Constants of methods, limits in code, sizes of other people's files."""
 
@@ -138,7 +139,7 @@ def test_figures_are_in_the_results_they_name(page: Path) -> None:
 def test_what_looks_measured_names_its_results(page: Path) -> None:
     text = page.read_text()
     for name, words, _ in NO_MEASUREMENTS:
-        if name == page.name:
+        if name == str(page.relative_to(ROOT)):
             assert words in text, f"'{words}' is no longer in {name}: take it off the list"
             text = text.replace(words, "")
     suspects = {block.line: looks_measured(block) for block in blocks(text) if not block.file}
@@ -218,7 +219,8 @@ def test_what_looks_measured_is_told_from_constants(text: str, measured: bool) -
 def test_bounds_of_the_precision_knobs_are_those_of_their_test() -> None:
     source = (ROOT / "tests/core/rasterizer/test_precision.py").read_text()
     bounds = ast.literal_eval(re.search(r"^BOUNDS = (\[.*?^\])", source, flags=re.M | re.S)[1])
-    rows = re.findall(r"^\| `(\w+)=(\w+)`(.*)\| (.* / .*) \|$", (ROOT / "docs/numerics.md").read_text(), flags=re.M)
+    page = (ROOT / "docs" / "explanation" / "numerics.md").read_text()
+    rows = re.findall(r"^\| `(\w+)=(\w+)`(.*)\| (.* / .*) \|$", page, flags=re.M)
     assert {(knob, value) for knob, value, _, _ in rows} == {("evaluation", "float32"), ("accumulation", "float32")}
     for *_, cell in rows:
         assert [float(number) for number in cell.split("/")] == list(bounds[0][3:])

@@ -1,4 +1,4 @@
-"""The table of the extremes suite in docs/numerics.md: between two markers, written by benchmarks/extremes.py."""
+"""The table of the extremes suite, which benchmarks/extremes.py writes into docs/explanation/numerics.md."""
 
 BEGIN, END = "<!-- extremes: written by benchmarks/extremes.py -->\n", "<!-- end of extremes -->\n"
 PATHS = ("eager", "compiled")

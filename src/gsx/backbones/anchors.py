@@ -1,7 +1,7 @@
 """Gaussians on anchors of a fixed grid (Scaffold-GS), at several levels of detail if asked for (Octree-GS).
 
 A backbone here is a representation (networks or explicit harmonics), with or without levels, with or without the Mip
-filters: each is a part that knows nothing of the others (docs/backbones.md).
+filters: each is a part that knows nothing of the others (docs/reference/backbones.md).
 """
 
 import math

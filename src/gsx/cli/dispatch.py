@@ -42,14 +42,14 @@ gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happ
   gsx -m K=V1,V2 ...        a run for every combination; hydra/launcher=processes|slurm for several at once
   gsx variant=octree_ub ... a method of the paper; dataset=mipnerf360 dataset.scene=garden budget=paper|quick|smoke
   gsx +experiment=TABLE ... a table of the paper: runs what is missing, skips what is finished
-  torchrun --nproc-per-node 2 -m gsx training.batch=2 ...   one scene on two GPUs (docs/clusters.md)
+  torchrun --nproc-per-node 2 -m gsx training.batch=2 ...   one scene on two GPUs (docs/how-to/sweeps-and-clusters.md)
   gsx --version, gsx --help, gsx VERB --help
 
 Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1,2]'.
 """
 TRADE_MOVED = (
     "gsx trade is gone. Compare settings of a training with `gsx -m KEY=A,B ...`, whose page draws the fronts; "
-    "settings of the rasterizer are measured by `python benchmarks/trades.py --what rasterizer` (docs/trade-offs.md)"
+    "`python benchmarks/trades.py --what rasterizer` measures those of the rasterizer (docs/how-to/choose-settings.md)"
 )
 
 
@@ -93,7 +93,7 @@ def dispatch_together(arguments: list[str]) -> int:
         raise ConfigError(f"gsx {words}: torchrun is for training one scene and for gsx resume; call gsx without it")
 
     if is_table(arguments):
-        raise ConfigError("a table is many runs, and torchrun is for one: call gsx without it (docs/clusters.md)")
+        raise ConfigError("torchrun trains one run and a table has many: call gsx without torchrun")
     return dispatch(arguments)
 
 

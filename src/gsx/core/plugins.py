@@ -1,7 +1,7 @@
 """The doors of gsx: hook specifications, the registry they fill, and discovery of installed plugins.
 
 Built-ins come in through the same hooks as third parties. A third party ships a wheel with an entry point in group
-`gsx` that names a module or object implementing hooks (docs/writing-plugins.md). A plugin that fails to load is
+`gsx` that names a module or object implementing hooks (docs/how-to/write-a-plugin.md). A plugin that fails to load is
 reported by `gsx plugins` and at the start of a run, and everything else goes on.
 """
 

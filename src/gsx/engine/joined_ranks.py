@@ -1,4 +1,4 @@
-"""One run on the processes of torchrun (docs/clusters.md).
+"""One run on the processes of torchrun (docs/how-to/sweeps-and-clusters.md).
 
 A rank that leaves, for an error or at its end, says so in place of its next object, so that nobody waits for it in
 vain; tensors are therefore exchanged only right after objects.

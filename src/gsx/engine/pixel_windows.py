@@ -5,7 +5,7 @@ Here each splat takes its integral over the window, and the window becomes the r
 variances along the axes as what the splat has left. The integral is the pixel's filter: there is no dilation.
 
 State of a pixel: `light` left (1 at first), `x`, `y` the window's middle and `wide`, `high` its sides, px. Tiles walk
-their lists splat by splat, because each window comes from the one before. Formulas: docs/numerics.md.
+their lists splat by splat, because each window comes from the one before. Formulas: docs/explanation/numerics.md.
 """
 
 import math

@@ -14,7 +14,7 @@ from gsx.core.plugins import Plugins, load_plugins
 from gsx.core.rasterizer import rasterize
 from gsx.experiments.runs.compose import compose
 
-PAGE = Path(__file__).parents[3] / "docs" / "writing-plugins.md"
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "write-a-plugin.md"
 
 
 @pytest.fixture(scope="module")

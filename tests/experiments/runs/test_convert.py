@@ -121,7 +121,7 @@ def test_the_pictures_of_an_unbundled_sog_count_for_what_is_trained(tmp_path: Pa
 
 
 def test_the_page_on_formats_names_all_kinds() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "formats.md").read_text()
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "formats.md").read_text()
     reading = page[page.index("\n## In\n") :]
     assert all(f"`{kind}`" in reading for kind in (*SUFFIXES, META))
 

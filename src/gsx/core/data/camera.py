@@ -1,7 +1,7 @@
 """Pinhole cameras and their exact algebra.
 
-Conventions (docs/conventions.md): x right, y down, z forward (OpenCV); pixel centres at +0.5, so the raster covers
-[0, width] x [0, height]; `cx`, `cy` are honoured everywhere and may lie outside the raster (crops).
+Conventions (docs/reference/conventions.md): x right, y down, z forward (OpenCV); pixel centres at +0.5, so the raster
+covers [0, width] x [0, height]; `cx`, `cy` are honoured everywhere and may lie outside the raster (crops).
 """
 
 import math
@@ -160,7 +160,7 @@ class Camera:
 def offsets_from(points: Float[Tensor, "P 3"], centre: Float[Tensor, "3"]) -> Float[Tensor, "P 3"]:
     """Return points - centre, subtracted in float64 and rounded to the dtype of the points; differentiable in both.
 
-    Far from the origin the centre itself, rounded first, would move by a grain of the coordinates (docs/numerics.md).
+    Rounding the centre first would move it by a float32 step of the coordinates (docs/explanation/numerics.md).
     """
     return (points.double() - uploaded(centre, points.device, torch.float64)).to(points)
 

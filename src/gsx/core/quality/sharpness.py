@@ -2,7 +2,7 @@
 
 Blur takes fine contrast away and leaves coarse contrast, and where the camera moved it does so along one axis. The
 ratio of both, along the axis that has less of it, is alike for photographs of one capture: compared with its
-neighbours, a photograph that moved by three pixels has half of it or less (docs/photographs.md).
+neighbours, a photograph that moved by three pixels has half of it or less (docs/explanation/photo-corrections.md).
 """
 
 import math

@@ -1,4 +1,4 @@
-"""ln alpha over the pixels of a tile, with its gradient (docs/numerics.md).
+"""ln alpha over the pixels of a tile, with its gradient (docs/explanation/numerics.md).
 
 Half the inverse covariance is U^T U with U = [[u0, u1], [0, u2]], so with d = pixel - mean
 

@@ -1,4 +1,4 @@
-"""The differentiable mathematics of the projection, eager or compiled (docs/numerics.md; 3D-GS section 3.2).
+"""Differentiable mathematics of the projection, eager or compiled (docs/explanation/numerics.md; 3D-GS section 3.2).
 
 Vectors are tuples of columns, one tensor of [M] per component: on a CPU a third of the time of the same formulas on
 rows of three, whose inner loops of length three leave vector units idle.

@@ -1,4 +1,4 @@
-"""World Gaussians to screen Gaussians, stable by construction (docs/numerics.md; 3D-GS sections 3.1 and 3.2)."""
+"""Stable projection of world Gaussians to the screen (docs/explanation/numerics.md; 3D-GS sections 3.1 and 3.2)."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The processes that train one run together, and their exchange of objects and tensors (docs/clusters.md)."""
+"""Processes that train one run together, and what they exchange (docs/how-to/sweeps-and-clusters.md)."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
 """Somebody who walks through the built-in scenes while they are photographed: in each training photograph elsewhere.
 
-Their truth is known: test pictures show nobody (research on what moves; docs/photographs.md).
+Their truth is known: test pictures show nobody (research on what moves; docs/explanation/photo-corrections.md).
 """
 
 from functools import partial
