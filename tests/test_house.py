@@ -68,3 +68,9 @@ def test_the_loop_names_no_feature(file: str) -> None:
     pattern = re.compile("|".join(re.escape(name) for name in sorted(registered | stems)))
     found = [line for line in (SOURCE / file).read_text().splitlines() if pattern.search(line)]
     assert not found
+
+
+def test_test_files_differ_in_name() -> None:
+    """pytest imports two files of one name as one module, and collects neither; packages have names of their own."""
+    files = [file for file in Path(__file__).parent.rglob("test_*.py") if not (file.parent / "__init__.py").exists()]
+    assert len({file.name for file in files}) == len(files)

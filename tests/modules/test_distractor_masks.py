@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from gsx.modules.captures import at_exposure, gains_between
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
@@ -23,6 +22,7 @@ from gsx.modules.distractor_masks import (
     with_their_colours,
     witnesses,
 )
+from gsx.modules.photo_pairs import gains, match_brightness
 
 SIZE = 64, 48
 
@@ -59,8 +59,8 @@ def seen(photographs: list[Tensor], counted: Tensor | None = None) -> list[Diffe
 
 def at_its_exposure(camera: Camera, image: Tensor, depth: Tensor, taken: Tensor) -> Difference:
     """A photograph against a render that is made as bright, and by how much that is."""
-    bright, gains = at_exposure(image, taken, None), gains_between(image, taken, None)
-    return difference_of(camera, bright, depth, torch.ones(48, 64), taken, gains=gains)
+    bright, ratio = match_brightness(image, taken, None), gains(image, taken, None)
+    return difference_of(camera, bright, depth, torch.ones(48, 64), taken, gains=ratio)
 
 
 def noisy(seed: int = 0, noise: float = 0.01) -> list[Tensor]:
