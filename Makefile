@@ -30,7 +30,7 @@ test: $(READY_DEV)
 test-slow: $(READY_DEV)
 	$(PYTEST) -m slow
 
-# Kills, full disks and signals; docs/explanation/reliability.md tells what was counted.
+# Kills, full disks and signals; docs/benchmarks/faults.md lists the counts.
 test-faults: $(READY_DEV)
 	rm -rf build/faults
 	$(PYTEST) -m faults --dist load

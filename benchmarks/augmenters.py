@@ -1,4 +1,4 @@
-"""Pseudo details against their control on held-out true pixels: the tables of docs/reference/augmenters.md.
+"""Pseudo details against their control on held-out true pixels: the tables of docs/benchmarks/pseudo-details.md.
 
     python benchmarks/augmenters.py [--scenes FOLDER] [--only fox] [--seeds 3] [--iterations 1000] [--jobs 2]
 

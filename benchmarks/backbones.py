@@ -1,4 +1,4 @@
-"""Train every backbone on the same photos and measure what zooming shows: the table of docs/reference/backbones.md.
+"""Train every backbone on the same photos and measure what zooming shows: the table of docs/benchmarks/backbones.md.
 
     python benchmarks/backbones.py SCENES [--only lego] [--backbones gs3d,scaffold] [--iterations 3000]
 

@@ -1,4 +1,4 @@
-"""Measure how many primitives a scene needs: published, budgeted and adaptive growth (docs/explanation/capacity.md).
+"""Measure how many primitives a scene needs: published, budgeted and adaptive growth (docs/benchmarks/capacity.md).
 
     python benchmarks/capacity.py [--scenes FOLDER] [--what growth,compact] [--only fox,lego] [--backbones gs3d]
 

@@ -1,4 +1,4 @@
-"""What real captures do, made on purpose, and what mends it: the tables of docs/explanation/photo-corrections.md.
+"""What real captures do, made on purpose, and what mends it: the tables of docs/benchmarks/photo-corrections.md.
 
     python benchmarks/captures.py --scenes FOLDER [--what exposure,light,poses,adjust,covered,passed,blur,sky]
                                   [--only demo,fox] [--seeds 0,1] [--share 0.4] [--label NAME]

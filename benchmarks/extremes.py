@@ -1,4 +1,4 @@
-"""Measure every case of the extremes suite and write the table into docs/explanation/numerics.md.
+"""Measure every case of the extremes suite and write the table into docs/benchmarks/extremes.md.
 
     python benchmarks/extremes.py
 
@@ -17,7 +17,7 @@ from extremes.cases import CASES, Case, scientific  # type: ignore[import-not-fo
 from extremes.comparison import measure, paths  # type: ignore[import-not-found]  # noqa: E402
 from extremes.table import COLUMNS, PATHS, rewritten  # type: ignore[import-not-found]  # noqa: E402
 
-PAGE = ROOT / "docs" / "explanation" / "numerics.md"
+PAGE = ROOT / "docs" / "benchmarks" / "extremes.md"
 
 
 def worst(case: Case, path: str) -> tuple[float, float]:

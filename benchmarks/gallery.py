@@ -1,7 +1,7 @@
-"""Pictures of every backbone as it is trained from the command line, at x1 and x4: python benchmarks/gallery.py
+"""Write the gallery, pictures of every backbone at x1 and x4: python benchmarks/gallery.py
 
-Trains the built-in scene by each backbone with its defaults, one seed, and writes docs/gallery.md: a held-out view as
-it is, and its middle four times as fine, beside the truth. Runs that are there (--runs) are gone on with and kept.
+Trains the built-in scene by each backbone with its defaults, one seed, and writes docs/gallery.md: a held-out view, its
+middle four times as fine, and the truth. Runs below --runs are resumed and kept.
 """
 
 import argparse
@@ -27,28 +27,33 @@ PAGE = ROOT / "docs" / "gallery.md"
 BACKBONES = ("gs3d", "mip_splatting", "gs3d_zoom", "octree_gs3d", "scaffold", "octree_scaffold")
 MEANING = {
     "gs3d": "3D-GS, as published",
-    "mip_splatting": "Mip-Splatting: 3D filter and 2D Mip filter",
-    "gs3d_zoom": "what plain `gsx` trains: Mip filters, trained through finer pixels",
-    "octree_gs3d": "levels of detail on explicit Gaussians",
-    "scaffold": "Scaffold-GS: Gaussians decoded from anchors",
-    "octree_scaffold": "Octree-GS: anchors in levels of detail",
+    "mip_splatting": "Mip-Splatting, with its 3D and 2D filters",
+    "gs3d_zoom": "The default of `gsx`, Mip filters and training through finer pixels",
+    "octree_gs3d": "Explicit Gaussians in levels of detail",
+    "scaffold": "Scaffold-GS, Gaussians decoded from anchors",
+    "octree_scaffold": "Octree-GS, anchors in levels of detail",
 }
 VIEW, ZOOM, SIDE = "test_003", 4, (320, 240)
-"""What is shown: a test view, and of it so many times as fine a window of that size, in the middle."""
+"""A test view, the factor of its zoom, and the size in px of the window in its middle."""
 SOURCE = "<!-- figures: benchmarks/results/gallery_cpu.json gallery -->"
-"""Above figures: where they are from."""
+"""Comment above figures that names their results."""
 COLUMNS = [
     ["backbone", "backbone"],
     ["x1", "PSNR x1, dB"],
     ["x4", "PSNR x4, dB"],
-    ["enlarged", "its x1 enlarged, dB"],
+    ["enlarged", "enlarged x1, dB"],
     ["primitives", "primitives"],
 ]
-NOTE = "Built-in scene, 900 steps, one seed, ten held-out views; a single run says nothing of small differences."
+NOTE = "Built-in scene, 900 steps, one seed, ten held-out views. One seed says nothing about small differences."
+CAPTION = (
+    "*Demo, 900 steps, one seed, ten held-out views, on a CPU ([machine](../benchmarks/results/gallery_cpu.md)).*\n"
+    "`python benchmarks/gallery.py`"
+)
+"""Of the page."""
 
 
 def trained(backbone: str, folder: Path) -> gsx.TrainedRun:
-    """The finished run of a backbone."""
+    """Trains a backbone where its run is missing or unfinished, and loads the run."""
     if not (folder / "evaluation.json").is_file():
         words = [f"backbone={backbone}", f"folder={folder}", "eval.zoom=[1,4]"]
         verb = ["resume", str(folder)] if folder.is_dir() else words
@@ -59,13 +64,13 @@ def trained(backbone: str, folder: Path) -> gsx.TrainedRun:
 
 
 def middle(image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 h w"]:
-    """The window that is shown of a zoomed picture."""
+    """Cuts the window out of the middle of a zoomed picture."""
     width, height = SIDE
     return Window((image.shape[2] - width) // 2, (image.shape[1] - height) // 2, width, height).cut(image)
 
 
 def row(backbone: str, run: gsx.TrainedRun) -> dict[str, Any]:
-    """Figures of a run."""
+    """Returns the figures of a run."""
     found = read_json(run.folder / "evaluation.json")
     return {
         "backbone": backbone,
@@ -77,7 +82,7 @@ def row(backbone: str, run: gsx.TrainedRun) -> dict[str, Any]:
 
 
 def draw(name: str, whole: Float[Tensor, "3 H W"], fine: Float[Tensor, "3 H W"]) -> None:
-    """The two pictures of a backbone, or of the truth."""
+    """Writes the two pictures of a backbone, or of the truth."""
     folder = PAGE.with_suffix("")
     folder.mkdir(parents=True, exist_ok=True)
     write_image(folder / f"{name}.x1.jpg", whole)
@@ -85,28 +90,32 @@ def draw(name: str, whole: Float[Tensor, "3 H W"], fine: Float[Tensor, "3 H W"])
 
 
 def page(rows: Sequence[dict[str, Any]]) -> str:
-    """The gallery."""
+    """Returns the text of the page."""
     lines = [
         "# Gallery",
         "",
-        "Every backbone with its defaults, trained on the built-in scene from the command line (`gsx backbone=NAME`):",
-        "a view that it never saw, and the middle of it four times as fine, which is detail that no photograph showed.",
+        "Compare the backbones by eye: a held-out view, and its middle four times as fine as any training picture.",
+        "Each is trained with its defaults on the built-in scene (`gsx backbone=NAME`). PSNR is the mean over all",
+        "held-out views; one seed says nothing about small differences. Figures of other scenes:",
+        "[backbones](benchmarks/backbones.md). Why zooming shows artefacts: [zooming in](explanation/zooming.md).",
+        "",
+        CAPTION,
     ]
     for entry in rows:
         name = entry["backbone"]
         figures = f"{entry['x1']:.2f} dB at x1, {entry['x4']:.2f} dB at x4, {entry['primitives']:,} primitives"
         lines += ["", f"## {name}", "", SOURCE, f"{MEANING[name]}: {figures}.", "", pictures(name)]
-    lines += ["", "## The truth", "", pictures("truth"), "", NOTE, ""]
+    lines += ["", "## The truth", "", pictures("truth"), ""]
     return "\n".join(lines)
 
 
 def pictures(name: str) -> str:
-    """Both pictures, side by side."""
+    """Returns the links to both pictures."""
     return f"![{name}, x1](gallery/{name}.x1.jpg) ![{name}, x4](gallery/{name}.x4.jpg)"
 
 
 def main(words: Sequence[str]) -> None:
-    """Train what is missing, draw, and write."""
+    """Trains what is missing, draws the pictures, writes results and page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=Path, default=Path("outputs/gallery"), help="folder of the runs")
     parser.add_argument("--only", default=",".join(BACKBONES), help="backbones, comma-separated")

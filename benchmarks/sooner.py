@@ -1,4 +1,4 @@
-"""Compare the default in fewer steps with published 3D-GS (docs/explanation/capacity.md).
+"""Compare the default in fewer steps with published 3D-GS (docs/benchmarks/capacity.md).
 
     python benchmarks/sooner.py [--scenes FOLDER] [--only demo,room,fox_4] [--seeds 0,1,2] [--jobs 2]
 

@@ -1,4 +1,4 @@
-"""Compare starting points and growth in rooms with plain walls (docs/explanation/capacity.md).
+"""Compare starting points and growth in rooms with plain walls (docs/benchmarks/capacity.md).
 
     python benchmarks/starts.py [--scenes FOLDER] [--only room,castle] [--seeds 0,1,2] [--jobs 2]
 

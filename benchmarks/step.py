@@ -1,4 +1,4 @@
-"""Time a training step by stage and compare it with another revision (docs/explanation/decisions.md).
+"""Time a training step by stage and compare it with another revision (docs/benchmarks/rasterizer.md).
 
     python benchmarks/step.py [--backbones gs3d,octree_scaffold]
     python benchmarks/step.py --scene fox --scenes FOLDER

@@ -1,4 +1,4 @@
-"""Measure what settings of training and of the rasterizer cost and bring (docs/how-to/choose-settings.md).
+"""Measure what settings of training and of the rasterizer cost and bring (docs/benchmarks/settings.md).
 
     python benchmarks/trades.py [--scenes FOLDER] [--only demo,fox,lego] [--seeds 0,1] [--jobs 2]
     python benchmarks/trades.py --what rasterizer [--run RUN] [rasterizer.KEY=VALUE ...]
@@ -33,7 +33,7 @@ from measuring.runs import train
 from measuring.watches import Patience
 from zoom import shared_arguments, steps_among, told
 
-PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "choose-settings.md"
+PAGE = Path(__file__).parents[1] / "docs" / "benchmarks" / "settings.md"
 TITLES = {"demo": "The built-in scene", "fox": "fox, an eighth", "lego": "lego, a quarter"}
 HALF, TWICE = "half the steps", "twice the steps"
 TRADES: dict[str, dict[str, tuple[str, ...]]] = {
@@ -68,8 +68,18 @@ COLUMNS = [
     *(["primitives", "primitives"], ["megabytes", "MB"], ["seconds", "training s"], ["times", "of as given"]),
     ["front", "best for its"],
 ]
-SHOWN = ("setting", "x1", "more1", "more2", "more4", "primitives", "megabytes", "times", "front")
-"""Columns of the page."""
+PAGE_COLUMNS = {
+    "setting": "setting",
+    "x1": "x1",
+    "more1": "x1 - base",
+    "more2": "x2 - base",
+    "more4": "x4 - base",
+    "primitives": "primitives",
+    "megabytes": "MB",
+    "times": "time, of base",
+    "front": "best for its",
+}
+"""Headings of the page by column."""
 NOTE = (
     "PSNR on held-out views, dB, means over seeds ± half their range; differences seed by seed, times are those of the "
     "last seed. MB of the standard splat file. Best: nothing else is at least as good at x4 for no more."
@@ -222,10 +232,10 @@ def page(text: str, sections: Mapping[str, Section]) -> str:
 
 
 def table(section: Section) -> str:
-    """The columns that the page shows."""
-    headings = dict(section["columns"])
-    lines = [[cell(row.get(key)) for key in SHOWN] for row in section["rows"]]
-    table = [[headings[key] for key in SHOWN], ["---"] * len(SHOWN), *lines]
+    """Returns the rows with the columns of the page."""
+    rows = [{**section["rows"][0], "setting": "base"}, *section["rows"][1:]]
+    lines = [[cell(row.get(key)) for key in PAGE_COLUMNS] for row in rows]
+    table = [list(PAGE_COLUMNS.values()), ["---"] * len(PAGE_COLUMNS), *lines]
     return "\n".join(f"| {' | '.join(row)} |" for row in table)
 
 

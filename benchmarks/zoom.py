@@ -1,4 +1,4 @@
-"""Looking closer, and from afar, on held-out true pixels: the tables of docs/explanation/zooming.md.
+"""Looking closer, and from afar, on held-out true pixels: the tables of docs/benchmarks/zooming.md.
 
     python benchmarks/zoom.py [--what compositions,afar] --scenes FOLDER [--only fox,lego] [--seeds 0,1,2] [--jobs 2]
 

@@ -1,4 +1,4 @@
-"""Run `gsx +experiment=zoom_truth` for several seeds and tabulate it (docs/explanation/zooming.md).
+"""Run `gsx +experiment=zoom_truth` for several seeds and tabulate it (docs/benchmarks/zooming.md).
 
     python benchmarks/zoom_truth.py --scenes FOLDER [--only fox,lego] [--seeds 0,1,2] [--rows zoom,...] [--jobs 2]
 

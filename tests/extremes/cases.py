@@ -219,14 +219,14 @@ def needles_from_far_outside() -> tuple[Splats, Camera]:
     return far, camera
 
 
-@case("needles 1:1e6 seen end on")
+@case("needles 1:1e6 viewed end on")
 def needles_end_on() -> tuple[Splats, Camera]:
     splats = before(needles(1.0, 1e-6))
     half_right_angle = torch.tensor([math.sqrt(0.5), 0, 0, math.sqrt(0.5)])  # turns x to y, about z
     return replace(splats, quats=half_right_angle.repeat(len(splats), 1)), along_y()
 
 
-@case("discs 1e6:1 seen edge on")
+@case("discs 1e6:1 viewed edge on")
 def discs_edge_on() -> tuple[Splats, Camera]:
     splats = before(ball(12))
     flat, level = torch.tensor([0.5, 0.5, 0.5e-6]), torch.tensor([1.0, 0, 0, 0])
@@ -296,7 +296,7 @@ def inside() -> tuple[Splats, Camera]:
     return ball(64, size=2.0, opacity=0.2), along_y(fov_x=1.2)
 
 
-@case("splats far beside the camera, just before the near plane")
+@case("splats far to the side of the camera, just before the near plane")
 def beside() -> tuple[Splats, Camera]:
     splats = ball(48, size=1.0, opacity=0.5)
     depths = 0.2 + 0.3 * torch.rand(48, generator=torch.Generator().manual_seed(1))

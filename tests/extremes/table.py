@@ -1,4 +1,4 @@
-"""The table of the extremes suite, which benchmarks/extremes.py writes into docs/explanation/numerics.md."""
+"""The table of the extremes suite, which benchmarks/extremes.py writes into docs/benchmarks/extremes.md."""
 
 BEGIN, END = "<!-- extremes: written by benchmarks/extremes.py -->\n", "<!-- end of extremes -->\n"
 PATHS = ("eager", "compiled")

@@ -1,4 +1,4 @@
-"""The table of docs/explanation/numerics.md speaks of the cases of the suite, and keeps their promises."""
+"""The table of docs/benchmarks/extremes.md lists the cases of the suite and keeps their bounds."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import pytest
 from extremes.cases import CASES, Case
 from extremes.table import BEGIN, COLUMNS, END, read, rewritten
 
-PAGE = (Path(__file__).parents[2] / "docs" / "explanation" / "numerics.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "benchmarks" / "extremes.md").read_text()
 ROWS = {cells[0]: dict(zip(COLUMNS, cells, strict=True)) for cells in read(PAGE)}
 
 

@@ -1,4 +1,4 @@
-"""Counts of the fault suite, one file a test, gathered into docs/explanation/reliability.md by make test-faults."""
+"""Counts of the fault suite, one file a test, gathered into docs/benchmarks/faults.md by make test-faults."""
 
 import json
 import os
@@ -51,7 +51,7 @@ def record(what: str, part: int = 0, seed: int | None = None) -> Iterator[Counts
 
 
 def table() -> str:
-    """Return the lines of docs/explanation/reliability.md: cases, seeds and seconds of each test that passed."""
+    """Return the lines of docs/benchmarks/faults.md: cases, seeds and seconds of each test that passed."""
     found: dict[str, list[dict]] = {}
     for path in sorted(COUNTED.glob("*.json")):
         facts = json.loads(path.read_text())
@@ -72,4 +72,4 @@ def write(page: Path) -> None:
 
 
 if __name__ == "__main__":
-    write(Path(__file__).parents[2] / "docs" / "explanation" / "reliability.md")
+    write(Path(__file__).parents[2] / "docs" / "benchmarks" / "faults.md")
