@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from reference_rasterizer import render_reference
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
-from gsx.core.rasterizer.reference import render_reference
 from gsx.engine.compositors import COMPOSITORS
 
 

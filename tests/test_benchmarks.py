@@ -10,13 +10,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 from raster_scenes import any_path
+from reference_rasterizer import render_reference
 from torch import Tensor
 
 import rasterizer as benchmark
 import step
 from gsx.core.errors import InputError
 from gsx.core.rasterizer.projection import project
-from gsx.core.rasterizer.reference import render_reference
 from gsx.engine import compiled
 from measuring import knobs, naive, rival, stages
 from measuring.adapter import LOOPS, blend_screen, learnable, loops_timed, settings_of

@@ -131,8 +131,8 @@ def test_levels_and_filters_have_the_distances_of_float64() -> None:
     within = torch.arange(len(means)) % 2 == 0
     bias = (1 - ideal + torch.where(within, 1e-4, -1e-4)).float()  # level 1 begins 1e-4 of a level away
     ones = torch.ones_like(of)
-    for places, seen_by, at in ((means, camera, views), (away, moved(camera), far_views)):
-        shown, _ = drawn(replace(levels, views=at), places, ones, bias, seen_by, levels.count - 1)
+    for places, mapped_to, at in ((means, camera, views), (away, moved(camera), far_views)):
+        shown, _ = drawn(replace(levels, views=at), places, ones, bias, mapped_to, levels.count - 1)
         assert torch.equal(shown, within)
     shares = [seen_fraction(replace(levels, views=v), p, of) for v, p in ((views, means), (far_views, away))]
     assert torch.equal(shares[1], shares[0])

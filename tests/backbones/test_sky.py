@@ -150,10 +150,10 @@ def test_what_cannot_have_a_sky_is_told_so() -> None:
 def test_what_lies_far_away_in_a_splat_file_is_sky_again() -> None:
     gaussians = with_sky().explicit(None, 1)
     backbone = small_gs3d(small_scene(spread(5)), options=replace(published_options(), sky="auto"))
-    backbone.go_on_from(gaussians)
+    backbone.start_from(gaussians)
     assert not_sky(backbone.table).tolist() == [True, True, True, False, False]
     plain = small_gs3d(small_scene(spread(5)))
-    plain.go_on_from(gaussians)
+    plain.start_from(gaussians)
     assert "sky" not in plain.table.columns
 
 

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 
 import torch
 from raster_scenes import any_path
+from reference_rasterizer import alpha_maps, frame_pixels, render_reference, whole
 from torch import Tensor
 
 from extremes.cases import Case
 from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
-from gsx.core.rasterizer.reference import alpha_maps, frame_pixels, render_reference, whole
 from gsx.engine.compiling import available
 
 FLOAT64_TOLERANCE = 1e-12

@@ -8,6 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from raster_scenes import any_path
+from reference_rasterizer import render_reference
 from torch import Tensor
 
 from extremes.cases import ball, scaled, view
@@ -16,7 +17,6 @@ from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
-from gsx.core.rasterizer.reference import render_reference
 
 LARGEST = float(torch.finfo(torch.float32).max)
 EDGES = [0.0, -0.0, 1e-45, -1e-39, 1e-20, 1e-12, 1e-6, 1e4, 1e6, 1e12, -1e15, -1e19, 1e20, 1e30, -1e38, LARGEST]

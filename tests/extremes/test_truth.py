@@ -4,11 +4,11 @@ from fractions import Fraction
 
 import pytest
 import torch
+from reference_rasterizer import render_reference, squared_distances
 from torch import Tensor
 
 from extremes.cases import ball, view
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.rasterizer.reference import render_reference, squared_distances
 
 
 def exact_squared_distance(root: Tensor, offset: Tensor) -> Fraction:

@@ -19,7 +19,7 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
 from gsx.core.training.photo_cache import PhotoCache
-from gsx.core.training.pseudo_views import PseudoView, kept_out, pseudo_loss
+from gsx.core.training.pseudo_views import PseudoView, mask_windows, pseudo_loss
 from gsx.core.training.run import Run
 from gsx.core.training.validation import rounding_in
 from gsx.experiments.runs.build import build
@@ -267,7 +267,7 @@ def test_where_a_pseudo_view_shows_a_window_is_told_by_what_it_was_made_from(
     now = replace(camera, translation=camera.translation + 0.01) if corrected else camera
     target = torch.zeros(3, 8, 12, dtype=torch.uint8)
     view = PseudoView(camera=camera, target=target, parent=0, provenance=provenance)
-    weight = kept_out(view, now, [Window(5, 2, 4, 3)]).pixel_weight
+    weight = mask_windows(view, now, [Window(5, 2, 4, 3)]).pixel_weight
     assert (0 if weight is None else int((weight[2:5, 5:9] == 0).sum())) == hidden
     assert weight is None or int((weight == 255).sum()) == 12 * 8 - hidden
 

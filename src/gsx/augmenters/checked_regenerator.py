@@ -15,7 +15,7 @@ from gsx.core.data.scene import View
 from gsx.core.errors import TrainingError
 from gsx.core.shapes import Float
 from gsx.core.training.augmenter import AugmenterContext
-from gsx.core.training.regenerator import Refusing, Regenerator, RegeneratorContext, Request
+from gsx.core.training.regenerator import Checkable, Regenerator, RegeneratorContext, Request
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 
@@ -131,8 +131,8 @@ class CheckedRegenerator:
         return cls(inner=context.regenerator(role), checks=checks or context.checks[role], tally=tally)
 
     def refuse(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
-        """Raises ConfigError or InputError before training if the regenerator cannot redraw these (`Refusing`)."""
-        if isinstance(self.inner, Refusing):
+        """Raises ConfigError or InputError before training if the regenerator cannot redraw these (`Checkable`)."""
+        if isinstance(self.inner, Checkable):
             self.inner.check(views, scales, moved)
 
     def prepare(self, run: Run, context: AugmenterContext) -> dict[str, float]:
@@ -147,7 +147,7 @@ class CheckedRegenerator:
                 seed=context.seed,
                 device=run.device,
                 folder=run.folder / "regenerators",
-                refuse_if_stopping=run.refuse_if_stopping,
+                raise_if_stopping=run.raise_if_stopping,
             )
         )
 

@@ -154,7 +154,7 @@ class PseudoDetails(Redrawing):
     def written(self, run: Run, event: int, view: int) -> list[PseudoView]:
         """The pseudo views of an event that begins with this step, made and written to its file."""
         steps = min(event + self.span, run.iterations) - run.step
-        views, facts = self.made(run, event, {view, *run.sampler.taken} | run.sampler.coming(steps - 1))
+        views, facts = self.made(run, event, {view, *run.sampler.current} | run.sampler.coming(steps - 1))
         self.store.write(run, event, views, facts)
         return views
 

@@ -65,7 +65,7 @@ class Redrawer:
         """Makes some pseudo views, and writes pictures of those of the training views `pictured`."""
         views = []
         requests = [self.request(run, event, spec) for spec in specs]
-        run.refuse_if_stopping()
+        run.raise_if_stopping()
         options = self.options
         redrawn = self.regenerator.redraw(requests, samples=options.samples, project=options.project == "exact")
         for spec, request, one in zip(specs, requests, redrawn, strict=True):
@@ -78,7 +78,7 @@ class Redrawer:
 
     def request(self, run: Run, event: int, spec: PseudoViewSpec) -> Request:
         """Describes a picture to the regenerator."""
-        run.refuse_if_stopping()
+        run.raise_if_stopping()
         view = run.train_views[spec.parent]
         outer = spec.outer
         image = render(run, spec.source).image if outer is None else photo_window(run, view, outer, spec.source)
@@ -129,7 +129,7 @@ class Redrawer:
 
     def coarser_view(self, run: Run, event: int, parent: int, factor: int) -> PseudoView:
         """Makes the pseudo view of a training camera at a fraction of its size, without partial blocks at the rim."""
-        run.refuse_if_stopping()
+        run.raise_if_stopping()
         view = run.train_views[parent]
         width, height = view.camera.size
         whole = Window(left=0, top=0, width=width, height=height)

@@ -183,7 +183,7 @@ class Anchors(SceneModel):
         self.filter.refresh(self.table, self.table["anchors"], step)
         return metrics
 
-    def settles(self) -> list[int]:
+    def milestones(self) -> list[int]:
         """Returns when growth ends."""
         return [self.events.stop]
 

@@ -137,7 +137,7 @@ class GS3D(SceneModel):
         self.capacity.initialise(table)
         return table
 
-    def go_on_from(self, gaussians: Gaussians) -> None:
+    def start_from(self, gaussians: Gaussians) -> None:
         """Takes Gaussians of a file, which are drawn as they are: it first takes off what the 3D filter adds.
 
         Raises:
@@ -211,7 +211,7 @@ class GS3D(SceneModel):
             metrics |= choose_sh_degrees(self, step)
         return metrics
 
-    def settles(self) -> list[int]:
+    def milestones(self) -> list[int]:
         """Returns when density control ends, and when SH degrees are chosen."""
         return [self.control.events.stop, self.sh_step()]
 

@@ -97,7 +97,7 @@ class Blur(Correction):
 
     def estimate_movement(self, run: Run, view: View) -> Movement:
         """Returns the movement of a photo's camera, px of the photo."""
-        run.refuse_if_stopping()
+        run.raise_if_stopping()
         small = reduced_to(view, run, MAX_PIXELS)
         photo, mask, image = small.image(), small.counted(), render(run, small.camera, supersample=1).image
         sharp = run.views.without(self).match_photo(image, None, small).detach().cpu()

@@ -167,7 +167,7 @@ def rows_of_distractors(run: Run, views: Sequence[View]) -> Bool[Tensor, "N"]:
     probe = Probe(model=run.backbone, views=run.views, step=run.model_step)
     hidden, total = run.background.new_zeros(2, len(run.backbone.table))
     for view in views:
-        run.refuse_if_stopping()
+        run.raise_if_stopping()
         small = coarser(view, run.scene.reduction, REDUCTION)
         masked, everywhere = probe.render(small.camera).blending_weights(small.counted())
         hidden, total = hidden + masked, total + everywhere

@@ -25,7 +25,7 @@ MIN_PIXELS, MIN_VIEWS = 64, 3
 
 def render_reduced(run: Run, view: View, depth: bool = True, min_pixels: int = 0) -> tuple[View, TiledRendering]:
     """Returns a reduced view and its render; the view as it is where the reduced one had fewer pixels."""
-    run.refuse_if_stopping()
+    run.raise_if_stopping()
     pixels = view.camera.width * view.camera.height / REDUCTION**2
     small = coarser(view, run.scene.reduction, REDUCTION) if pixels >= min_pixels else view
     return small, render(run, small.camera, supersample=1, depth=depth)

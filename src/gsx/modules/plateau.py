@@ -20,7 +20,7 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Float
-from gsx.core.training.backbone import Settling
+from gsx.core.training.backbone import WithMilestones
 from gsx.core.training.importance import Probe
 from gsx.core.training.module import ModuleContext, TrainingModule
 from gsx.core.training.run import Run
@@ -184,7 +184,7 @@ class Plateau(TrainingModule):
 
 def last_milestone(run: Run, before: int) -> int:
     """Returns the last step at which modules or backbone do something once, before a step."""
-    steps = list(run.backbone.settles()) if isinstance(run.backbone, Settling) else []
+    steps = list(run.backbone.milestones()) if isinstance(run.backbone, WithMilestones) else []
     steps += [step for module in run.modules.values() for step in module.milestones()]
     return max((step for step in steps if step < before), default=0)
 

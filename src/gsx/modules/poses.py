@@ -190,7 +190,7 @@ class Poses(Correction):
 def photo_pairs(run: Run, views: Sequence[View]) -> Iterator[tuple[Tensor, Tensor, Tensor | None, float]]:
     """Yields (render, photo, pixels that count, px of the photo per pixel) of reduced views."""
     for view in views:
-        run.refuse_if_stopping()
+        run.raise_if_stopping()
         small = coarser(view, run.scene.reduction, REDUCTION)
         image = render(run, small.camera).image
         yield image, small.image(), small.counted(), view.camera.focal / small.camera.focal

@@ -211,7 +211,7 @@ def learn(
     optimiser = torch.optim.Adam(network.parameters(), lr=options.rate)
     decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps, eta_min=options.rate / 100)
     for _ in range(steps):
-        context.refuse_if_stopping()
+        context.raise_if_stopping()
         render, photo = (part.to(device) for part in batch(pairs, options, generator))
         out = render + network(render)
         loss = (out - photo).abs().mean() + 0.1 * sum(

@@ -160,7 +160,7 @@ def train(
     losses: list[float] = []
     begun = time.perf_counter()
     for _ in range(options.steps):
-        context.refuse_if_stopping()
+        context.raise_if_stopping()
         if options.seconds and time.perf_counter() - begun > options.seconds:
             logger.warning(
                 "scene_sr stops after %d of %d steps: regenerator.upscale.seconds", len(losses), options.steps

@@ -1,4 +1,4 @@
-"""MLflow: parameters, metrics and files of a run in a store beside the runs, or on a tracking server."""
+"""MLflow: parameters, metrics and files of a run, in a local store or on a tracking server."""
 
 import logging
 import os
@@ -211,7 +211,7 @@ def own_store(run: Run) -> str:
 
 
 def experiment_id(client: Any, uri: str, name: str) -> str:
-    """Creates an experiment with its files beside the database, or finds it; returns its id."""
+    """Returns the id of an experiment; creates it if needed, with its files in the database's folder."""
     from mlflow.exceptions import MlflowException
 
     local = uri.startswith(SQLITE)  # MLflow's own choice is the current folder

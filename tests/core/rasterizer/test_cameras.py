@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 from raster_scenes import SMOOTH, changed, front_camera, random_splats, soft_splats
+from reference_rasterizer import render_reference
 
 from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.rasterizer.reference import render_reference
 
 
 def intrinsics_of(camera: Camera) -> torch.Tensor:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from reference_rasterizer import render_reference
 from safetensors import safe_open
 from torch import Tensor
 
@@ -14,7 +15,6 @@ from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.projection import project
-from gsx.core.rasterizer.reference import render_reference
 
 FILE = Path(__file__).parents[2] / "golden" / "gsplat.safetensors"
 with safe_open(FILE, "pt") as opened:

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference_rasterizer import render_reference
 from torch.nn.functional import logsigmoid
 
 from gsx.core.data.camera import Camera, look_at
@@ -13,7 +14,6 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.quaternions import rotation_matrices
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.rasterizer.reference import render_reference
 
 
 def scene(count: int = 200, seed: int = 0, channels: int = 3) -> Splats:

@@ -5,12 +5,12 @@ import math
 import pytest
 import torch
 from extremes.comparison import undecided
+from reference_rasterizer import render_reference
 from torch.nn.functional import logsigmoid
 
 from gsx.core.data.camera import look_at
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.rasterizer.reference import render_reference
 
 FIELDS = ("means", "scales", "quats", "log_opacities", "colours")
 

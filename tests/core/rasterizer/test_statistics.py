@@ -7,10 +7,10 @@ from inspect import getsource
 import pytest
 import torch
 from raster_scenes import changed, front_camera, leaves, random_splats, render_with_gradients, run_script
+from reference_rasterizer import alpha_maps, frame_pixels
 
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.rasterizer.reference import alpha_maps, frame_pixels
 
 
 def scene_of(seed: int) -> tuple[Splats, torch.Tensor]:

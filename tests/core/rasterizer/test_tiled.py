@@ -5,13 +5,13 @@ from typing import Any
 import pytest
 import torch
 from raster_scenes import any_path, changed, front_camera, leaves, random_splats, run_script
+from reference_rasterizer import render_reference
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import Rendering, rasterize, rasterize_tiled, tiled
-from gsx.core.rasterizer.reference import render_reference
 from gsx.core.rasterizer.tiled import covering
 from gsx.engine.compiled import available
 

@@ -157,7 +157,7 @@ def test_what_a_term_makes_shared_parameters_forget_is_its_own_only(tmp_path: Pa
         {"own": (float(first) + 0.9 * float(second)) / 2, "still": float(value.detach()) / 2}, rel=1e-5
     )
     assert float(step.loss) == pytest.approx(sum(step.terms.values()), rel=1e-5)
-    assert len(step.seen) == 3  # the first photograph, the pseudo view, the second photograph
+    assert len(step.observations) == 3  # the first photograph, the pseudo view, the second photograph
 
 
 # -- density control ---------------------------------------------------------------------------------------------------
@@ -200,7 +200,7 @@ class Judge:
         run.sampler.order, run.sampler.batch = [0, 5, 1, 4], batch
         run.augmenters = dict(enumerate(augmenters))
         for _ in range(steps):
-            for seen in backward(run).seen:
+            for seen in backward(run).observations:
                 run.backbone.accumulate(seen)
             zero_grad(run.backbone.table)
         return {name: value.clone() for name, value in run.backbone.table.statistics.items()}

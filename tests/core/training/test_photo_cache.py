@@ -37,12 +37,12 @@ def test_what_has_room_is_decoded_once_and_makes_room_for_others() -> None:
     first, second, coarse = sources = [Counted(51), Counted(102), Counted(255)]
     views = [View(str(number), CAMERA, source) for number, source in enumerate(sources)]
     photographs = PhotoCache(torch.device("cpu"), room=BYTES)
-    photographs.see(views[:2])
+    photographs.set_views(views[:2])
     for _ in range(2):
         assert torch.equal(photographs.of(views[0]), torch.full((3, 4, 8), 51.0) / 255)
         assert torch.equal(photographs.of(views[1]), torch.full((3, 4, 8), 102.0) / 255)
     assert (first.asked, second.asked, photographs.room) == (1, 2, 0)
-    photographs.see(views[2:])
+    photographs.set_views(views[2:])
     assert photographs.room == BYTES
     for _ in range(2):
         assert torch.equal(photographs.of(views[2]), torch.ones(3, 4, 8))
@@ -54,13 +54,13 @@ def test_what_ssim_takes_of_a_photograph_is_found_once_while_there_is_room(monke
     pictures = [view.image() for view in views]
     monkeypatch.setattr(module, "MOMENT_BYTES", 2 * 2 * 4 * BYTES + 1)  # two of each four-byte number of two pictures
     photographs = PhotoCache(torch.device("cpu"), room=0)
-    photographs.see(views)
+    photographs.set_views(views)
     first = [photographs.moments_of(view, picture, EAGER) for view, picture in zip(views, pictures, strict=True)]
     assert first[2] is None
     for found, view, picture in zip(first[:2], views, pictures, strict=False):
         assert photographs.moments_of(view, picture, EAGER) is found
         assert all(map(torch.equal, found, moments_of(picture)))
-    photographs.see(views[2:])
+    photographs.set_views(views[2:])
     assert not photographs.moments
     assert photographs.moments_of(views[2], pictures[2], EAGER) is not None
 
@@ -74,12 +74,12 @@ def test_training_is_the_same_whether_there_is_room_or_not(
     """Also where views change on the way."""
     most = []
 
-    def see(self: PhotoCache, views: Sequence[View]) -> None:
+    def set_views(self: PhotoCache, views: Sequence[View]) -> None:
         most.append(len(self.moments))
         plain(self, views)
 
-    plain = PhotoCache.see
-    monkeypatch.setattr(PhotoCache, "see", see)
+    plain = PhotoCache.set_views
+    monkeypatch.setattr(PhotoCache, "set_views", set_views)
     run = tiny_run(tmp_path / "kept", ["iterations=12", *words])
     assert max(most) >= 4  # of six
     assert not run.photos.moments

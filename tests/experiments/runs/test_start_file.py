@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from reference_rasterizer import render_reference
 from tiny import OVERRIDES, final_tensors, tiny_run, tiny_settings
 
 from gsx.builtin import plugins
@@ -15,7 +16,6 @@ from gsx.core.data.resize import to_uint8
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.drawn import splats_of
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.rasterizer.reference import render_reference
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.run_folder.run_key import composition_key, scene_stamp
 from gsx.experiments.runs.compose import compose

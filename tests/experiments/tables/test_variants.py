@@ -8,7 +8,7 @@ from tiny import tiny_settings
 
 from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.builtin import plugins
-from gsx.core.training.augmenter import Foretold
+from gsx.core.training.augmenter import KnownStart
 from gsx.core.training.run import Run
 from gsx.experiments.run_folder.run_key import composition_key
 from gsx.experiments.runs.compose import Compositions, listed
@@ -159,7 +159,7 @@ def test_where_pseudo_views_begin_is_foretold(composed: dict[str, Settings]) -> 
     def begins(name: str) -> int:
         settings = composed[name]
         options = [chosen.options for chosen in settings.augmenters.values()]
-        assert all(isinstance(option, Foretold) for option in options)
+        assert all(isinstance(option, KnownStart) for option in options)
         return min(option.begins(settings.general.iterations) for option in options)
 
     expected = {"octree_up": 22000, "octree_ub": 20000, "octree_ub_start_15k": 15000, "octree_ub_de_mlp": 10000,

@@ -31,7 +31,7 @@ class Window:
         """Return the camera through this window."""
         return camera.crop(self.left, self.top, self.width, self.height)
 
-    def seen_by(self, other: Camera, camera: Camera) -> "Window":
+    def mapped_to(self, other: Camera, camera: Camera) -> "Window":
         """Return the pixels of another raster that show a part of this window of `camera`; maybe none."""
         left, right = (
             (edge - camera.cx) / camera.fx * other.fx + other.cx for edge in (self.left, self.left + self.width)

@@ -48,7 +48,7 @@ class WithBackend(Protocol):
 
 
 @runtime_checkable
-class Demanding(Protocol):
+class Restricted(Protocol):
     """A compositor that does not run everywhere."""
 
     def refuse(self, settings: "RasterSettings", device: torch.device) -> None:

@@ -1,1 +1,1 @@
-"""A run and its steps: the trainer, and what it asks of backbones, augmenters and regenerators."""
+"""Training: the trainer, the run, and the interfaces of backbones, modules, augmenters and regenerators."""

@@ -1,4 +1,8 @@
-"""The interface of a backbone, and the context that it is built from."""
+"""Backbones: scene representations that train themselves and are drawn as splats.
+
+A plugin registers one by `registry.add("backbone", NAME, factory, options)`; `factory(options, context)` returns a
+`Backbone`. It may implement the other protocols of this module as well.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,54 +26,55 @@ from gsx.core.training.training_views import TrainingViews
 
 T = TypeVar("T")
 MOST_LOST, FEW = 0.01, 10
-"""Share of the primitives that a step may lose because they cannot be drawn, and how many of few."""
+"""Largest loss of undrawable primitives in a step: share of all, and number in small models."""
 CAUTION = "caution"
-"""Key of a plan's part whose text is logged as a warning."""
+"""Key in a plan whose text is logged as a warning."""
 Observation: TypeAlias = dict[str, Tensor]
-"""What density control learns from one render, as tensors by name, none of them 0-dimensional; empty: nothing."""
+"""Statistics of one render for density control: tensors of at least one dimension by name; empty: none."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BackboneContext:
-    """Scene, schedule, rules and randomness that a backbone is built from."""
+    """Scene, schedule, rasterizer rules and random generator that a backbone is built from."""
 
     scene: Scene
     iterations: int
+    """Steps of the whole run."""
     device: torch.device
     raster: RasterSettings
-    """Rules of the rasterizer, unless the backbone has others (`Backbone.raster`)."""
+    """Rasterizer rules; the backbone may change them (`Backbone.raster`)."""
     generator: torch.Generator
-    """The run's only source of randomness (a CPU generator)."""
+    """CPU generator, the only source of random numbers."""
     views: TrainingViews
-    """Training views at each step, how they are rendered, and compared with renders."""
+    """Training views at each step, with their rasters and corrections."""
     ranks: Ranks = Ranks()
-    """The processes that train it together."""
+    """Processes that train it together."""
     begins: bool = True
-    """Whether the model starts from the scene; otherwise a checkpoint replaces its table."""
+    """True: the model starts from the scene; False: a checkpoint will replace its table."""
 
     def on_rank0(self, measure: Callable[[], T]) -> T:
-        """Runs a measurement on rank 0 and broadcasts the result and the generator's state; tensors are on the CPU.
+        """Runs a measurement on rank 0 and broadcasts result and generator state; tensors must be on the CPU.
 
-        All ranks then decide alike, though their renders may differ in a last bit.
+        All ranks then decide alike, even if their renders differ in the last bit.
         """
         result, state = self.ranks.broadcast(lambda: (measure(), self.generator.get_state()))
         self.generator.set_state(state)
         return result
 
     def points(self) -> PointCloud:
-        """Returns the points that the model starts from.
+        """Returns the initial points.
 
         Raises:
-            InputError: the scene has no points.
+            InputError: the scene has none.
         """
         if len(self.scene.points) == 0:
             raise InputError(
-                f"scene '{self.scene.name}' has no points to start from: give it points or scene.points=random"
+                f"scene '{self.scene.name}' has no points to start from: add points or set scene.points=random"
             )
         return self.scene.points
 
     def schedule(self, published_iterations: int) -> Schedule:
-        """Maps steps of a published run of that length onto this run."""
+        """Returns the map from steps of a published run of that length to this run."""
         return Schedule(
             iterations=self.iterations, published_iterations=published_iterations, views=len(self.scene.train)
         )
@@ -77,22 +82,22 @@ class BackboneContext:
 
 @runtime_checkable
 class Drawn(Protocol):
-    """The splats of one camera; each backbone adds what it needs to learn from the render."""
+    """Splats of one camera; a backbone may add what its `observe` and `regulariser` need."""
 
     @property
     def splats(self) -> Splats:
-        """M explicit Gaussians, differentiable."""
+        """M Gaussians, differentiable."""
         ...
 
     @property
     def rows(self) -> Int[Tensor, "M"] | None:
-        """Row of the table that each splat comes from; None: splat n is row n."""
+        """Table row of each splat; None: splat n is row n."""
         ...
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawnSplats:
-    """Splats and their rows, for backbones that need no more."""
+    """Splats and their table rows."""
 
     splats: Splats
     rows: Int[Tensor, "M"] | None = None
@@ -103,52 +108,55 @@ D = TypeVar("D", bound=Drawn)
 
 @runtime_checkable
 class Backbone(Protocol[D]):
-    """A scene representation that trains itself and draws itself as splats.
+    """A scene representation that is drawn as splats and updates its own parameters.
 
     A step calls, in this order: for each view `draw`, `regulariser`, (backward), `observe`; for each observation
-    `accumulate`; `densify_and_prune`, `update`. Gradients of the views add up in between. Steps count from 1.
-    Checkpoints, sizes, gradients and the removal of what is not finite follow from the table.
+    `accumulate`; then `densify_and_prune` and `update`. Gradients of the views add up. Steps count from 1.
     """
 
     table: ParameterTable
-    """Everything that it learns, and all that it needs to resume exactly."""
+    """All learned values, and all state that an exact resume needs."""
     raster: RasterSettings
-    """Rules of the rasterizer for its splats: those of the context, with its filters."""
+    """Rasterizer rules for its splats: the context's, with its own filters."""
     absolute_gradient: bool
-    """Whether `observe` needs absolute gradients of training renders."""
+    """True: `observe` needs absolute gradients of training renders."""
 
     def draw(self, camera: Camera, step: int) -> D:
-        """Returns the splats of a camera at a step."""
+        """Returns the splats for a camera at a step."""
         ...
 
     def regulariser(self, drawn: D) -> Float[Tensor, ""] | None:
-        """Returns a term to add to the loss of a view, or None."""
+        """Returns a term of the view's loss, or None."""
         ...
 
     def observe(self, drawn: D, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
-        """Returns what density control learns from a render of what was drawn, after its backward pass.
+        """Returns the statistics of a render for density control, after its backward pass.
 
-        `weight`: of the render in the step's loss, whose gradients its screen means have (`backbones.density`).
+        Args:
+            drawn: Result of `draw`.
+            rendering: Its render, with gradients of the step's loss at the screen means.
+            step: Current step.
+            weight: Weight of the render in the step's loss (`backbones.density`).
         """
         ...
 
     def accumulate(self, observation: Observation) -> None:
-        """Adds an observation of this process, or of another that trains the same model, to the statistics."""
+        """Adds an observation, of this or another process, to the statistics."""
         ...
 
     def densify_and_prune(self, step: int) -> Mapping[str, float]:
-        """Changes the number of rows; returns metrics for the log, empty when nothing was done."""
+        """Adds and removes rows; returns metrics for the log, empty if nothing changed."""
         ...
 
     def update(self, step: int) -> None:
-        """Moves the parameters by the learning rates of this step, and clears their gradients."""
+        """Updates the parameters by the learning rates of this step, and clears their gradients."""
         ...
 
     def explicit(self, camera: Camera | None, step: int) -> Gaussians:
-        """Returns Gaussians of a standard splat file: those a camera draws, or (None) those that hold for all.
+        """Returns Gaussians for a standard splat file, as drawn for a camera or, with None, for all cameras.
 
         Raises:
-            GsxError: no camera is given, and there is no camera-independent form.
+            GsxError: the camera is None, and the splats depend on the camera.
         """
         ...
 
@@ -158,39 +166,39 @@ class Planned(Protocol):
     """A backbone with a schedule to log."""
 
     def plan(self) -> dict[str, Any]:
-        """Returns the rescaled schedule in absolute steps: numbers or lists by name, in parts by name; see CAUTION."""
+        """Returns the rescaled schedule in absolute steps: numbers or lists by name, grouped by name; see CAUTION."""
         ...
 
 
 @runtime_checkable
-class Settling(Protocol):
-    """A backbone that does things once, at steps that a run must not leave out."""
+class WithMilestones(Protocol):
+    """A backbone with steps that no module may skip."""
 
-    def settles(self) -> Sequence[int]:
-        """Returns steps at which something is done once, or after which something is done no more."""
+    def milestones(self) -> Sequence[int]:
+        """Returns steps at which it acts once, or after which it stops acting."""
         ...
 
 
 @runtime_checkable
 class Validating(Protocol):
-    """A backbone that keeps windows of training views out of the loss for a while, to measure by them."""
+    """A backbone that keeps validation windows of training views out of the loss for a while."""
 
     def validation_window(self, view: View, step: int) -> Window | None:
-        """Returns the window of the view that counts in no loss at this step; None: all of it counts."""
+        """Returns the view's window that enters no loss at a step; None: no window."""
         ...
 
 
 @runtime_checkable
 class Backdrop(Protocol):
-    """A backbone with splats behind the scene, which have no depth of their own."""
+    """A backbone with splats behind the scene, at no particular depth."""
 
     def behind_scene(self, means: Float[Tensor, "M 3"]) -> Bool[Tensor, "M"]:
-        """Marks splats that are too far away for any camera to tell their depth."""
+        """Marks splats too far away for any camera to measure their depth."""
         ...
 
 
 def behind_scene(backbone: Backbone[Any], means: Float[Tensor, "M 3"]) -> Bool[Tensor, "M"]:
-    """Marks splats behind the scene; none where the backbone has no backdrop."""
+    """Marks splats behind the scene; none without a backdrop."""
     if isinstance(backbone, Backdrop):
         return backbone.behind_scene(means)
     return torch.zeros_like(means[:, 0], dtype=torch.bool)
@@ -198,46 +206,46 @@ def behind_scene(backbone: Backbone[Any], means: Float[Tensor, "M 3"]) -> Bool[T
 
 @runtime_checkable
 class PseudoViewListener(Protocol):
-    """A backbone that takes notice of new pseudo views."""
+    """A backbone that uses new pseudo views."""
 
     def pseudo_views_made(self, views: Sequence[PseudoView], step: int) -> None:
-        """Takes the pseudo views that were made for a step, mostly none, before density control and update."""
+        """Receives the pseudo views made for a step, before density control and update; mostly none."""
         ...
 
 
 @runtime_checkable
 class WithHarmonics(Protocol):
-    """A backbone whose colours change with direction, by spherical harmonics."""
+    """A backbone with colours in spherical harmonics."""
 
     sh_degree: int
-    """Highest degree of its colours; code for it is compiled before the first step."""
+    """Highest degree; its kernels are compiled before the first step."""
 
 
 @runtime_checkable
 class WithOwnFile(Protocol):
-    """A backbone whose published code writes splat files with more in them than standard ones."""
+    """A backbone whose published code writes splat files with more columns than standard ones."""
 
     def file_columns(self) -> dict[str, Float[Tensor, "N"]] | None:
-        """Returns columns of that file, in order; None: as it is composed, a standard file says everything."""
+        """Returns the columns of that file, in order; None: a standard file is complete."""
         ...
 
     def file_notes(self) -> list[str]:
-        """Returns comments of any file of it: what a viewer must know beside the screen dilation."""
+        """Returns comments for its files: hints for viewers other than the screen dilation."""
         ...
 
 
 @runtime_checkable
 class Bakeable(Protocol):
-    """A backbone whose splats depend on the camera, and can be followed from one camera to the next."""
+    """A backbone whose splats depend on the camera, but have numbers that do not (slots)."""
 
     def slot_count(self) -> int:
-        """Returns how many numbers there are."""
+        """Returns the number of slots."""
         ...
 
     def slots(self, drawn: Any) -> tuple[Int[Tensor, "M"], Int[Tensor, "V"]]:
-        """Returns (a number for each splat drawn, the same from every camera; numbers of all that could be drawn).
+        """Returns the slot of each drawn splat, and the slots of all candidates of this camera.
 
-        Those that could be drawn and are not have opacity 0 for this camera.
+        Candidates that are not drawn have opacity 0 for this camera.
         """
         ...
 
@@ -246,23 +254,23 @@ class Bakeable(Protocol):
 class FromGaussians(Protocol):
     """A backbone that can start from a standard splat file (`init=FILE`)."""
 
-    def go_on_from(self, gaussians: Gaussians) -> None:
-        """Replaces what it was built with by these; no band of their colours waits for a later step.
+    def start_from(self, gaussians: Gaussians) -> None:
+        """Replaces its initial Gaussians by those of a file, with all harmonic bands active.
 
         Raises:
-            InputError: it cannot, as it is composed.
+            InputError: its options do not allow that.
         """
         ...
 
 
 @torch.no_grad()
 def remove_nonfinite(backbone: Backbone[Any], cameras: Sequence[Camera], step: int) -> int:
-    """Removes rows with values that are not finite, or that one of the cameras cannot draw; returns how many.
+    """Removes rows that are not finite or that one of the cameras cannot draw; returns their number.
 
-    Where nothing is removed nothing changes, gradients included.
+    If it is 0, nothing changes, gradients included.
 
     Raises:
-        LostModel: so much would be lost that what is left is another model. Nothing is removed.
+        LostModel: too many rows would be removed. Nothing is removed.
     """
     rows = [parameter.detach().reshape(len(parameter), -1) for parameter in backbone.table.parameters.values()]
     kept = torch.stack([torch.isfinite(values).all(1) for values in rows]).all(0)
@@ -270,11 +278,9 @@ def remove_nonfinite(backbone: Backbone[Any], cameras: Sequence[Camera], step: i
         kept &= drawable_rows(backbone, camera, step)
     lost, count = int((~kept).sum()), len(kept)
     if lost and (lost == count or lost > max(FEW, MOST_LOST * count)):
-        share = f"none of {count:,} primitives has values that are finite and can be drawn"
-        if lost < count:
-            share = f"{lost:,} of {count:,} primitives have values that are not finite or cannot be drawn"
         raise LostModel(
-            f"step {step}: {share}: lower the learning rates (backbone.rates), and see in what units the scene is"
+            f"step {step}: {lost:,} of {count:,} primitives have values that are not finite or cannot be drawn: "
+            "lower the learning rates (backbone.rates), and check the units of the scene"
         )
     if lost:
         keep_rows(backbone.table, kept)
@@ -282,9 +288,9 @@ def remove_nonfinite(backbone: Backbone[Any], cameras: Sequence[Camera], step: i
 
 
 def drawable_rows(backbone: Backbone[Any], camera: Camera, step: int) -> Bool[Tensor, "N"]:
-    """Marks rows that the camera draws or does not see: False for splats or volumes that are out of range.
+    """Marks all rows except those in view with splats or volumes out of range.
 
-    Where none of those in view can be drawn, networks are to blame, if there are any, and no row.
+    If no row in view can be drawn and there are networks, these are the cause, and all rows are marked.
     """
     drawn, table = backbone.draw(camera, step), backbone.table
     splats = drawn.splats

@@ -1,4 +1,4 @@
-"""Differentiable renders of a training step, and what density control learns from them."""
+"""Differentiable renders of a training step, and observations for density control."""
 
 from dataclasses import replace
 
@@ -12,9 +12,9 @@ from gsx.core.training.run import Run
 
 
 def render_for_training(run: Run, camera: Camera, step: int, colour: Float[Tensor, "3"]) -> tuple[Drawn, Rendering]:
-    """Returns (what the backbone draws at a step, its render), over a background colour.
+    """Renders what the backbone draws at a step over a background colour; returns both.
 
-    Screen statistics are of the raster that was drawn; the picture is reduced from it.
+    Screen statistics are those of the raster that was drawn; the picture is reduced from it.
     """
     raster, absolute = run.views.raster_for(step)(camera), run.backbone.absolute_gradient
     drawn = run.backbone.draw(raster.drawn_for, step)
@@ -24,10 +24,9 @@ def render_for_training(run: Run, camera: Camera, step: int, colour: Float[Tenso
 
 
 def observe(run: Run, drawn: Drawn, rendering: Rendering, step: int, weight: float) -> Observation:
-    """Returns what density control learns from a render of that weight in its view's loss; of weight 0 nothing.
+    """Returns the observation of a render with a weight in its view's loss; empty for weight 0.
 
-    The step's loss is the mean over the batch: weight and screen gradients are divided by the number of views, as the
-    gradients of the parameters will be.
+    Weight and screen gradients are divided by the number of views, since the step's loss is the mean over the batch.
     """
     if not weight > 0:
         return {}

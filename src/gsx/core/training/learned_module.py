@@ -1,4 +1,4 @@
-"""Training modules that learn tensors of their own by Adam, beside the model."""
+"""Training modules with learned tensors."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,7 +10,7 @@ from gsx.core.training.module import ModuleContext, TrainingModule
 
 
 class LearnedModule(TrainingModule):
-    """A module with learned tensors: they take part in backward, get an Adam step after the model's, and are saved."""
+    """Training module whose tensors are learned by Adam, after the model's step, and saved in checkpoints."""
 
     def __init__(self, options: Any, context: ModuleContext, rate: float, **tensors: Tensor) -> None:
         super().__init__(options, context)
@@ -19,15 +19,15 @@ class LearnedModule(TrainingModule):
         self.optimizer = torch.optim.Adam(self.learned.values(), lr=rate)
 
     def zero_grad(self) -> None:
-        """Drop gradients."""
+        """Clears gradients."""
         self.optimizer.zero_grad()
 
     def optimizer_step(self, step: int) -> None:
-        """Take an Adam step."""
+        """Takes an Adam step."""
         self.optimizer.step()
 
     def supports(self, ranks: int) -> bool:
-        """Returns whether one process trains: gradients of modules are not exchanged."""
+        """Returns True for one process: gradients of modules are not exchanged."""
         return ranks == 1
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -38,7 +38,7 @@ class LearnedModule(TrainingModule):
         return tensors
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on from the tensors of a checkpoint; empty: from the start."""
+        """Restores the tensors of a checkpoint; empty: keeps the initial ones."""
         for name, value in self.learned.items() if tensors else ():
             value.data.copy_(tensors[name])
             prefix = f"adam.{name}."
@@ -47,5 +47,5 @@ class LearnedModule(TrainingModule):
 
 
 def device_of(key: str, value: Tensor) -> torch.device:
-    """Returns where Adam keeps an entry of its state: the number of steps stays on the CPU."""
+    """Returns the device of an entry of Adam's state: the step count stays on the CPU."""
     return torch.device("cpu") if key == "step" else value.device

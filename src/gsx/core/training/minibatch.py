@@ -1,7 +1,7 @@
-"""Several views in one step, on one process or on several: gradients, losses and observations become those of one.
+"""Several views in one step, on one process or several: gradients, losses and observations of their mean loss.
 
-Every view's own loss is sent back, and the sums are divided in the end. An observation counts by its weight in the
-mean loss (`backbones.density`), so that published thresholds hold for any number of views.
+Backward runs for each view's loss; the sums are divided at the end. An observation counts by its weight in the mean
+loss (`backbones.density`), so that published thresholds hold for any number of views.
 """
 
 from collections import Counter
@@ -18,7 +18,7 @@ from gsx.core.training.run import Run, StepResult
 
 @contextmanager
 def rollback_on_error(run: Run) -> Iterator[None]:
-    """A step that fails has not been taken: a checkpoint written then begins with the same views and colours again."""
+    """Restores sampler and generator and clears gradients if the step raises."""
     colours = run.generator.get_state()
     try:
         yield
@@ -31,7 +31,7 @@ def rollback_on_error(run: Run) -> Iterator[None]:
 
 @contextmanager
 def gradients_added(table: ParameterTable) -> Iterator[None]:
-    """A view begins without gradients, because its terms may forget some, and ends with the sums of all so far."""
+    """Clears gradients for the block, whose terms may drop some, and adds the earlier ones at its end."""
     before = gradients(table)
     zero_grad(table)
     yield
@@ -42,42 +42,42 @@ def gradients_added(table: ParameterTable) -> Iterator[None]:
 
 @dataclass(frozen=True, kw_only=True)
 class Account:
-    """What a rank tells the others of its views after their backward passes."""
+    """A rank's report to the others after its backward passes."""
 
     losses: list[float]
     terms: list[dict[str, float]]
     dropped: int
     learnt: set[str]
-    """Parameters that have a gradient."""
+    """Names of parameters with a gradient."""
     pseudo: dict[str, dict[str, Any]]
-    """Accounts of the pictures that its augmenters requested."""
+    """Accounts of its augmenters, by name."""
 
 
-def merge_gradients(run: Run, steps: Sequence[StepResult]) -> StepResult:
-    """The step of the whole batch, from steps of this rank's views; the gradients become those of the mean loss."""
+def merge_gradients(run: Run, results: Sequence[StepResult]) -> StepResult:
+    """Merges the results of this rank's views and of all ranks into one; gradients become those of the mean loss."""
     own = Account(
-        losses=[float(step.loss) for step in steps],
-        terms=[step.terms for step in steps],
-        dropped=sum(step.dropped for step in steps),
+        losses=[float(result.loss) for result in results],
+        terms=[result.terms for result in results],
+        dropped=sum(result.dropped for result in results),
         learnt=set(gradients(run.backbone.table)),
-        pseudo=steps[0].pseudo,
+        pseudo=results[0].pseudo,
     )
     accounts = run.ranks.all_gather(own)
     average(run, set().union(*(account.learnt for account in accounts)))
     losses = [loss for account in accounts for loss in account.losses]
     return replace(
-        steps[0],
+        results[0],
         loss=torch.tensor(losses, device=run.device).mean(),
         terms=mean_terms(losses, [terms for account in accounts for terms in account.terms]),
-        seen=run.ranks.gathered([seen for step in steps for seen in step.seen], run.device),
+        observations=run.ranks.gathered([one for result in results for one in result.observations], run.device),
         dropped=sum(account.dropped for account in accounts),
-        others=steps[1:],
+        others=results[1:],
         pseudo=merge_accounts([account.pseudo for account in accounts]),
     )
 
 
 def average(run: Run, learnt: set[str]) -> None:
-    """Turn sums of gradients on each rank into the mean over the batch on all; `learnt`: parameters that have any."""
+    """Turns each rank's sums of gradients into the mean over the batch, for the named parameters."""
     moved = [parameter for name, parameter in named_parameters(run.backbone.table) if name in learnt]
     for parameter in moved:
         parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
@@ -88,7 +88,7 @@ def average(run: Run, learnt: set[str]) -> None:
 
 
 def mean_terms(losses: Sequence[float], terms: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Mean of every part of the loss over views; those without parts have the backbone's own alone. None: no parts."""
+    """Returns the mean over views of each part of the loss; a view without parts has the backbone's `own` alone."""
     if not any(terms):
         return {}
     whole = [parts or {"own": loss} for loss, parts in zip(losses, terms, strict=True)]
@@ -97,7 +97,7 @@ def mean_terms(losses: Sequence[float], terms: Sequence[dict[str, float]]) -> di
 
 
 def merge_accounts(accounts: Sequence[Mapping[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
-    """Merges the accounts of several ranks into one, by augmenter (`augmenter.Accounting`)."""
+    """Adds up the accounts of several ranks, by augmenter (`augmenter.Accounting`)."""
     merged = {}
     for name in dict.fromkeys(name for by_name in accounts for name in by_name):
         parts = [by_name[name] for by_name in accounts if name in by_name]
@@ -112,7 +112,7 @@ def merge_accounts(accounts: Sequence[Mapping[str, dict[str, Any]]]) -> dict[str
 
 
 def sum_by_scale(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Adds counts of pictures up by scale."""
+    """Adds up counts of pictures by scale."""
     total: Counter[str] = Counter()
     for count in counts:
         total.update(count)

@@ -1,9 +1,8 @@
-"""What a model learns: rows of parameters with their Adam state, edited together, and networks that all rows share.
+"""Learned state of a model: rows of parameters with their Adam state, and networks that all rows share.
 
-Every parameter of a table has one row per primitive and its own Adam group. Rows are appended with zero moments, unless
-others are given, and removed with their moments; a group's step count is never reset (3D-GS). A parameter touched by
-surgery is a new leaf without gradient, so the optimiser leaves it alone until the next backward pass, as in the
-published code.
+Every parameter has one row per primitive and its own Adam group. Appended rows get zero moments by default, removed
+rows lose theirs; a group's step count is never reset (3D-GS). An edited parameter is a new leaf without gradient, so
+Adam leaves it alone until the next backward pass, as in the published code.
 """
 
 from collections import ChainMap
@@ -21,11 +20,11 @@ from gsx.core.shapes import Bool
 ADAM_EPSILON = 1e-15
 """Gradients of a mean loss are tiny (3D-GS, training_setup)."""
 RECORD = "record."
-"""Prefix of entries of a record in checkpoints."""
+"""Prefix of the record's entries in checkpoints."""
 
 
 def adam(groups: Mapping[str, list[Parameter]]) -> torch.optim.Adam:
-    """Builds Adam with a named group for each list of parameters, at rate 0."""
+    """Returns an Adam with a named group for each list of parameters, at rate 0."""
     named = [{"params": parameters, "name": name, "lr": 0.0} for name, parameters in groups.items()]
     return torch.optim.Adam(named, eps=ADAM_EPSILON, fused=True)
 
@@ -37,12 +36,12 @@ def group_of(optimiser: torch.optim.Adam, name: str) -> dict:
 
 @dataclass(eq=False)
 class Networks:
-    """Networks that all primitives share, and the Adam that moves them, with a group for each, at rate 0 at first."""
+    """Networks that all primitives share, with an Adam group for each, at first at rate 0."""
 
     modules: nn.Module
-    """A network for each child; a learning rate is set by its name."""
+    """Each child is a network with a learning rate of its own."""
     colour: nn.Module
-    """The network of them that makes colours, which pseudo views may leave alone."""
+    """The colour network among them; pseudo views may leave it alone."""
     optimiser: torch.optim.Adam = field(init=False)
 
     def __post_init__(self) -> None:
@@ -63,11 +62,11 @@ class Networks:
         group_of(self.optimiser, name)["lr"] = rate
 
     def named(self) -> Iterator[tuple[str, Parameter]]:
-        """Yields parameters by their names in checkpoints."""
+        """Yields parameters with their names in checkpoints."""
         return ((f"heads.{name}", parameter) for name, parameter in self.modules.named_parameters())
 
     def buffers(self) -> Iterator[tuple[str, Tensor]]:
-        """Yields what networks keep beside parameters (means of a batch norm ...), by its names in checkpoints."""
+        """Yields buffers (means of a batch norm ...) with their names in checkpoints."""
         state = self.modules.state_dict(keep_vars=True).items()
         return (
             (f"buffers.{name}", value)
@@ -78,20 +77,20 @@ class Networks:
 
 @dataclass(eq=False)
 class ParameterTable:
-    """Everything a model learns and knows: N rows of each parameter and of what belongs to them, and networks."""
+    """Learned state of a model: N rows of each parameter, column and statistic, networks, and a record."""
 
     parameters: dict[str, Parameter]
     columns: dict[str, Tensor] = field(default_factory=dict)
-    """Values with N rows that are not learnt, but drawn with: levels, filter sizes, positions on a grid."""
+    """Fixed values with N rows that rendering needs: levels, filter sizes, positions on a grid."""
     statistics: dict[str, Tensor] = field(default_factory=dict)
-    """Values with N rows that density control gathers; new rows begin with 0."""
+    """Values with N rows that density control accumulates; 0 in new rows."""
     networks: Networks | None = None
     record: dict[str, Tensor] = field(default_factory=dict)
-    """Findings and decisions of density control, without rows; entries may be added at any step."""
+    """State of density control without rows; entries may be added at any step."""
     pace: float = 1.0
     """Factor of all learning rates (`training.cooldown`)."""
     former_names: Mapping[str, str] = field(default_factory=dict)
-    """Names of parameters in old checkpoints, by their names of today."""
+    """Names of parameters in old checkpoints, by current name."""
     optimiser: torch.optim.Adam = field(init=False)
 
     def __post_init__(self) -> None:
@@ -102,7 +101,7 @@ class ParameterTable:
 
     @property
     def device(self) -> torch.device:
-        """The device of all tensors."""
+        """Device of all tensors."""
         return next(iter(self.parameters.values())).device
 
     def __getitem__(self, name: str) -> Tensor:
@@ -123,7 +122,7 @@ class ParameterTable:
 def edit(
     table: ParameterTable, name: str, change: Callable[[Tensor], Tensor], moments: Callable[[Tensor], Tensor]
 ) -> None:
-    """Replaces a parameter by `change` of it and its Adam moments by `moments` of them."""
+    """Applies `change` to a parameter and `moments` to its Adam moments."""
     old = table.parameters[name]
     new = Parameter(change(old.detach()).contiguous())
     state = table.optimiser.state.pop(old, None)
@@ -143,10 +142,7 @@ def appending(new: Tensor) -> Callable[[Tensor], Tensor]:
 
 
 def append_rows(table: ParameterTable, rows: dict[str, Tensor], squares: Mapping[str, Tensor] | None = None) -> None:
-    """Appends rows to every parameter and column; `rows` names all of them.
-
-    Moments and statistics begin with 0, second moments with `squares` where these are given.
-    """
+    """Appends rows to all parameters and columns, with zero statistics and moments; `squares`: second moments."""
     count = len(next(iter(rows.values())))
     for name in table.parameters:
         edit(table, name, appending(rows[name]), appending(torch.zeros_like(rows[name])))
@@ -159,7 +155,7 @@ def append_rows(table: ParameterTable, rows: dict[str, Tensor], squares: Mapping
 
 
 def keep_rows(table: ParameterTable, kept: Bool[Tensor, "N"]) -> None:
-    """Keeps the marked rows of every parameter, with their moments, of every column, and of the statistics."""
+    """Keeps the marked rows of all parameters (with moments), columns and statistics."""
     for name in table.parameters:
         edit(table, name, lambda old: old[kept], lambda moment: moment[kept])
     for values in (table.columns, table.statistics):
@@ -167,17 +163,17 @@ def keep_rows(table: ParameterTable, kept: Bool[Tensor, "N"]) -> None:
 
 
 def reset_column(table: ParameterTable, name: str, values: Tensor) -> None:
-    """Replaces all values of one parameter and zeroes its moments."""
+    """Replaces the values of one parameter and zeroes its moments."""
     edit(table, name, lambda old: values, torch.zeros_like)
 
 
 def detached_rows(table: ParameterTable) -> dict[str, Tensor]:
-    """Returns all parameters and columns by name, without gradient: what `append_rows` needs rows of."""
+    """Returns all parameters and columns by name, detached."""
     return {name: parameter.detach() for name, parameter in table.parameters.items()} | table.columns
 
 
 def second_moments(table: ParameterTable) -> dict[str, Tensor]:
-    """Returns Adam's second moments by the name of the parameter, of parameters that have learnt."""
+    """Returns Adam's second moments by parameter name, of parameters with Adam state."""
     states = {name: table.optimiser.state.get(parameter) for name, parameter in table.parameters.items()}
     return {name: state["exp_avg_sq"] for name, state in states.items() if state}
 
@@ -186,28 +182,28 @@ def second_moments(table: ParameterTable) -> dict[str, Tensor]:
 
 
 def named_parameters(table: ParameterTable) -> list[tuple[str, Parameter]]:
-    """Returns name and value of everything that is learnt, in the same order on every process."""
+    """Returns all learned parameters with their names, in the same order on every process."""
     return [*table.parameters.items(), *(table.networks.named() if table.networks else ())]
 
 
 def gradients(table: ParameterTable) -> dict[str, Tensor]:
-    """Returns gradients by name, of the parameters that have one."""
+    """Returns the gradients by parameter name."""
     return {name: parameter.grad for name, parameter in named_parameters(table) if parameter.grad is not None}
 
 
 def shared_colour(table: ParameterTable) -> list[Parameter]:
-    """Returns parameters of colour that all primitives share; pseudo views may leave them alone."""
+    """Returns the parameters of the colour network; pseudo views may leave them alone."""
     return [] if table.networks is None else list(table.networks.colour.parameters())
 
 
 def zero_grad(table: ParameterTable) -> None:
-    """Clears all gradients without moving anything."""
+    """Clears all gradients."""
     for _, parameter in named_parameters(table):
         parameter.grad = None
 
 
 def take_adam_step(table: ParameterTable) -> None:
-    """Moves everything that has a gradient by its learning rate times the table's pace; then clears the gradients."""
+    """Takes an Adam step, with learning rates times the table's pace, and clears the gradients."""
     networks = [] if table.networks is None else [table.networks.optimiser]
     for optimiser in [table.optimiser, *networks]:
         with paced(optimiser, table.pace):
@@ -217,7 +213,7 @@ def take_adam_step(table: ParameterTable) -> None:
 
 @contextmanager
 def paced(optimiser: torch.optim.Optimizer, pace: float) -> Iterator[None]:
-    """Multiplies learning rates by `pace` inside the block."""
+    """Multiplies the learning rates by `pace` inside the block."""
     rates = [group["lr"] for group in optimiser.param_groups]
     try:
         for group, rate in zip(optimiser.param_groups, rates, strict=True):
@@ -229,7 +225,7 @@ def paced(optimiser: torch.optim.Optimizer, pace: float) -> Iterator[None]:
 
 
 def size_of(table: ParameterTable) -> tuple[int, int]:
-    """Returns (rows, bytes of what a render needs: parameters, columns and networks)."""
+    """Returns the number of rows and the bytes of parameters, columns and networks."""
     needed = [*(parameter for _, parameter in named_parameters(table)), *table.columns.values()]
     return len(table), sum(value.numel() * value.element_size() for value in needed)
 
@@ -238,7 +234,7 @@ def size_of(table: ParameterTable) -> tuple[int, int]:
 
 
 def learnt(table: ParameterTable) -> Iterator[tuple[str, str, Parameter, torch.optim.Adam]]:
-    """Yields (key in checkpoints, name, parameter, its optimiser) of everything that is learnt."""
+    """Yields (key in checkpoints, name, parameter, optimiser) of all learned parameters."""
     for name, parameter in table.parameters.items():
         yield f"parameters.{name}", name, parameter, table.optimiser
     if table.networks is not None:
@@ -247,7 +243,7 @@ def learnt(table: ParameterTable) -> Iterator[tuple[str, str, Parameter, torch.o
 
 
 def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
-    """Returns everything of a table by its names in checkpoints."""
+    """Returns all tensors of a table by their names in checkpoints."""
     out = {f"columns.{name}": column for name, column in table.columns.items()}
     out |= {f"statistics.{name}": sums for name, sums in table.statistics.items()}
     out |= {f"{RECORD}{name}": entry for name, entry in table.record.items()}
@@ -260,12 +256,10 @@ def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
 
 
 def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> ParameterTable:
-    """Restores what `table_tensors` returned, whatever its number of rows, with learning rates and networks of `like`.
-
-    Of the record all that was saved comes back, whether `like` has it by now or not.
+    """Restores the table of a checkpoint, with any number of rows, and learning rates and networks of `like`.
 
     Raises:
-        CheckpointError: something of it was not saved: the run had other options.
+        CheckpointError: a tensor is missing, as in a run with other options.
     """
     for name, former in like.former_names.items():
         if name in like.parameters and f"parameters.{name}" not in tensors:
@@ -289,7 +283,7 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> Paramete
 
 
 def restore_adam(name: str, parameter: Parameter, optimiser: torch.optim.Adam, tensors: dict[str, Tensor]) -> None:
-    """Restores Adam's step count and moments of one parameter; none before its first step."""
+    """Restores Adam's step count and moments of one parameter, if there are any."""
     if f"adam.{name}.step" in tensors:
         shapes = {"step": torch.Size(), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
         state = {key: saved(f"adam.{name}.{key}", shape, tensors) for key, shape in shapes.items()}
@@ -297,24 +291,20 @@ def restore_adam(name: str, parameter: Parameter, optimiser: torch.optim.Adam, t
 
 
 def saved(key: str, shape: torch.Size, tensors: dict[str, Tensor]) -> Tensor:
-    """Returns a tensor of a checkpoint.
-
-    Raises:
-        CheckpointError: there is none of that shape.
-    """
+    """Returns a tensor of a checkpoint; CheckpointError: there is none of that shape."""
     if key not in tensors or tensors[key].shape != shape:
-        raise CheckpointError(f"the checkpoint holds no {key} of shape {list(shape)}: remove it to use an older one")
+        raise CheckpointError(f"the checkpoint has no {key} of shape {list(shape)}: remove it to use an older one")
     return tensors[key]
 
 
 def saved_rows(kind: str, like: dict[str, Tensor], tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Returns the saved values of one kind, by name; older checkpoints hold some statistics as columns."""
+    """Returns the saved values of a kind by name; older checkpoints have some statistics as columns."""
     kinds = (kind, "columns") if kind == "statistics" else (kind,)
     names = {name: next((f"{k}.{name}" for k in kinds if f"{k}.{name}" in tensors), "") for name in like}
     missing = [name for name, key in names.items() if not key]
     if missing:
         raise CheckpointError(
-            f"the checkpoint holds no {' and no '.join(missing)}: it was trained with other options of the backbone; "
-            "go on with those, or train anew"
+            f"the checkpoint has no {' and no '.join(missing)}: it was trained with other options of the backbone; "
+            "resume with those, or train anew"
         )
     return {name: tensors[key] for name, key in names.items()}

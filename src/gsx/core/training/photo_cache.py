@@ -1,4 +1,4 @@
-"""Photos where a run computes: bytes on the device, as long as there is room; on a CPU also their SSIM moments."""
+"""Training photos on the run's device, with their SSIM moments on a CPU."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,9 +13,9 @@ from gsx.core.quality.losses import moments_of
 from gsx.core.shapes import Float, UInt8
 
 GPU_SHARE = 0.25
-"""Largest share of a GPU's free memory that photos take."""
+"""Largest share of a GPU's free memory for photos."""
 MOMENT_BYTES = 1 << 29
-"""Most bytes that SSIM's moments of photos take."""
+"""Most bytes for SSIM moments of photos."""
 
 
 def room_for_photos(device: torch.device) -> int:
@@ -32,43 +32,38 @@ class PhotoCache:
     """Bytes left for more photos."""
     kept: dict[View, UInt8[Tensor, "3 H W"]] = field(default_factory=dict)
     moments: dict[View, tuple[Tensor, Tensor]] = field(default_factory=dict)
-    """SSIM's moments of photos (`moments_of`)."""
+    """SSIM moments of photos (`losses.moments_of`)."""
     views: Sequence[View] = ()
-    """Views that are trained on now."""
+    """Current training views."""
 
-    def see(self, views: Sequence[View]) -> None:
-        """Drop photos of all views but these, which are trained on from now on."""
+    def set_views(self, views: Sequence[View]) -> None:
+        """Sets the current training views and drops the photos of all others."""
         if views is self.views:
             return
-        self.views, wanted = views, set(views)
-        for view in [view for view in self.kept if view not in wanted]:
+        self.views, current = views, set(views)
+        for view in [view for view in self.kept if view not in current]:
             self.room += self.kept.pop(view).nbytes
-        self.moments = {view: moments for view, moments in self.moments.items() if view in wanted}
+        self.moments = {view: moments for view, moments in self.moments.items() if view in current}
 
     def of(self, view: View) -> Float[Tensor, "3 H W"]:
         """Returns `view.image()` on the device."""
-        return self.bytes_of(view).float() / 255.0
-
-    def moments_of(
-        self, view: View, target: Float[Tensor, "3 H W"], backend: Backend
-    ) -> tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"]] | None:
-        """What SSIM takes of a photograph alone, `target`; None where it is not kept: compiled code of a GPU finds all
-        at once, and what there is no room for is as soon found anew."""
-        found = self.moments.get(view)
-        if found is not None or self.device.type != "cpu":
-            return found
-        taken = sum(2 * one.nbytes for one, _ in self.moments.values())
-        if taken + 2 * target.nbytes > MOMENT_BYTES:
-            return None
-        with torch.no_grad():  # as the loss finds them: by the same compiled code
-            found = self.moments[view] = moments_of(target, backend=backend)
-        return found
-
-    def bytes_of(self, view: View) -> UInt8[Tensor, "3 H W"]:
-        """The photograph, on the device."""
         picture = self.kept.get(view)
         if picture is None:
             picture = uploaded(view.picture(), self.device)
             if picture.nbytes <= self.room:
                 self.kept[view], self.room = picture, self.room - picture.nbytes
-        return picture
+        return picture.float() / 255.0
+
+    def moments_of(
+        self, view: View, target: Float[Tensor, "3 H W"], backend: Backend
+    ) -> tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"]] | None:
+        """Returns the SSIM moments of a photo; None: the loss computes them, without room or on a GPU."""
+        found = self.moments.get(view)
+        if found is not None or self.device.type != "cpu":
+            return found
+        used = sum(2 * one.nbytes for one, _ in self.moments.values())
+        if used + 2 * target.nbytes > MOMENT_BYTES:
+            return None
+        with torch.no_grad():  # by the same compiled code as in the loss
+            found = self.moments[view] = moments_of(target, backend=backend)
+        return found

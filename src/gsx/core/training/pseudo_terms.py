@@ -1,4 +1,4 @@
-"""Terms of augmenters in the loss of a training view: their pseudo views are rendered, compared and learnt from."""
+"""Terms of augmenters in the loss of a training view: render their pseudo views, compare, send gradients back."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -14,15 +14,15 @@ from gsx.core.shapes import Float
 from gsx.core.training.backbone import Observation, PseudoViewListener
 from gsx.core.training.forward import observe, render_for_training
 from gsx.core.training.parameter_table import shared_colour
-from gsx.core.training.pseudo_views import PseudoView, Term, kept_out, pseudo_loss
+from gsx.core.training.pseudo_views import PseudoView, Term, mask_windows, pseudo_loss
 from gsx.core.training.run import Run
 
 Divided: TypeAlias = tuple[Term, Sequence[tuple[PseudoView, float]]]
-"""(a term, the parts of it that the training view's render serves)"""
+"""(term, its parts that reuse the training view's render)"""
 
 
 def request_terms(run: Run, step: int, views: Sequence[int]) -> list[list[Term]]:
-    """Asks the augmenters for their terms for each training view, and hands new pseudo views to the backbone."""
+    """Collects the augmenters' terms for each training view, and passes new pseudo views to the backbone."""
     requested = [[augmenter.term(run, step, view) for augmenter in run.augmenters.values()] for view in views]
     terms = [[term for term in of_view if term is not None] for of_view in requested]
     if isinstance(run.backbone, PseudoViewListener):
@@ -32,16 +32,16 @@ def request_terms(run: Run, step: int, views: Sequence[int]) -> list[list[Term]]
 
 
 def without_windows(term: Term, camera: Camera, windows: Sequence[Window]) -> Term:
-    """Removes what the pseudo views of a term show of windows of the training camera."""
+    """Masks windows of the training camera in the pseudo views of a term."""
     if not windows:
         return term
-    return replace(term, parts=[(kept_out(view, camera, windows), weight) for view, weight in term.parts])
+    return replace(term, parts=[(mask_windows(view, camera, windows), weight) for view, weight in term.parts])
 
 
 def reusable_parts(term: Term, camera: Camera, random_background: bool) -> Divided:
-    """Separates the parts of a term that the render of the training view serves: their cameras draw just that.
+    """Separates the parts of a term whose cameras draw just what the training view's does.
 
-    Terms that density control does not learn from have none: it could not tell their gradients from the view's.
+    A term that density control does not observe has none: its gradients could not be separated from the view's.
     """
     if random_background or not (term.shared and term.observed):
         return term, ()
@@ -50,20 +50,20 @@ def reusable_parts(term: Term, camera: Camera, random_background: bool) -> Divid
 
 
 def backward_terms(run: Run, terms: Sequence[Term], step: int, observations: list[Observation]) -> dict[str, float]:
-    """Sends terms back, first those that leave shared parameters alone; returns their values by name."""
+    """Runs backward for all terms, first those without shared parameters; returns their values by name."""
     ordered = sorted(terms, key=lambda term: term.shared)
     return {term.name: backward_term(run, term, step, observations) for term in ordered}
 
 
 def backward_term(run: Run, term: Term, step: int, observations: list[Observation]) -> float:
-    """Sends a term back and returns its value; appends what density control learns from its renders."""
+    """Runs backward for a term and returns its value; appends the observations of its renders."""
     total = 0.0
     for view, weight in term.parts:
         drawn, rendering = render_for_training(run, view.camera, step, run.background)
         loss = weight * pseudo_loss(rendering.image, view, term.squared)
         loss.backward()
         total += float(loss.detach())
-        gradient = rendering.screen.means2d_offset.grad  # that of a step to be vetoed may not be finite
+        gradient = rendering.screen.means2d_offset.grad  # not finite in a step that will be skipped
         finite = math.isfinite(total) and (gradient is None or bool(torch.isfinite(gradient).all()))
         if term.observed and finite:
             observations.append(observe(run, drawn, rendering, step, weight))

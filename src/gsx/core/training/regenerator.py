@@ -1,4 +1,4 @@
-"""What redraws a picture: an upscaler, a restorer. It knows nothing of Gaussians."""
+"""Regenerators: upscalers and restorers of pictures, which know nothing of Gaussians."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,86 +16,93 @@ from gsx.core.shapes import Float
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Request:
-    """A picture to redraw, and all that is known about it."""
+    """A picture to regenerate, with its origin."""
 
     image: Float[Tensor, "3 h w"]
     """Display values in [0, 1]."""
     scale: int
-    """The result is this many times as wide and high."""
+    """Factor of the result's width and height."""
     reduction: Reduction = Reduction()
-    """By which a result becomes `image`: the scene's. The default: box averages of display values."""
+    """Filter that reduces a result to `image`; the default is a box average of display values."""
     camera: Camera
-    """That sees `image`."""
+    """Camera of `image`."""
     view: View
-    """The training view it was made from."""
+    """Training view it was made from."""
     number: int
-    """Of that view."""
+    """Index of that view."""
     photo: bool
-    """Whether `image` was cut out of the photograph; else it was rendered."""
+    """True: `image` is cut from the photo; False: it is rendered."""
     seed: int
     strength: float
-    """How much may change, 0 to 1, for regenerators that know such a thing."""
+    """Share of the picture that may change, 0 to 1, for regenerators with such a setting."""
     strongest: float
-    """The largest strength of any event."""
+    """Largest strength of all events."""
     prompt: str
     step: int
 
     @property
     def result_size(self) -> tuple[int, int]:
-        """(height, width) of the result."""
+        """(height, width) of the result, px."""
         height, width = self.image.shape[1:]
         return height * self.scale, width * self.scale
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RegeneratorContext:
-    """What a regenerator may learn from before its first call: training views only."""
+    """Training views and renders that a regenerator may learn from."""
 
     views: Sequence[View]
     reduction: Reduction = Reduction()
-    """How the scene's pictures come from finer ones."""
+    """Filter that made the scene's pictures from finer ones."""
     render: Callable[[Camera], Float[Tensor, "3 h w"]]
-    """The model as it is now."""
+    """Renders the current model."""
     held_out: Callable[[float], list[Float[Tensor, "3 h w"]]]
-    """The views, in order, as models show them that were fitted to the other half of the views alone, each for that
-    share of the steps that the run has taken (`halves`): what to learn repair from. Costs that training, once."""
+    """Renders all views by models that learned the other half, for that share of the run's steps so far (`halves`):
+    examples of faulty renders. Costs that training, once."""
     step: int
     seed: int
     device: torch.device
     folder: Path
-    """Where what was learnt can be kept; a resumed run finds it there."""
-    refuse_if_stopping: Callable[[], None] = lambda: None
-    """To be called now and then by what takes long: leaves it by an exception when the run was asked to stop."""
+    """Folder for learned files; a resumed run finds them there."""
+    raise_if_stopping: Callable[[], None] = lambda: None
+    """Raises `Stopped` if the run is stopping; call it regularly in long work."""
 
 
 @runtime_checkable
 class Regenerator(Protocol):
-    """Redraws pictures."""
+    """An upscaler or restorer of pictures."""
 
     def prepare(self, context: RegeneratorContext) -> dict[str, float]:
-        """Learn from the scene, if there is anything to learn; returns figures for the log. Called at every event."""
+        """Learns from the scene, if anything; returns metrics for the log. Called at every event."""
         ...
 
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
-        """A picture for each request, in order; display values."""
+        """Returns a picture for each request, in order; display values."""
         ...
 
 
 @runtime_checkable
 class NamesCode(Protocol):
-    """Options of a regenerator that runs code which is part of no installed package."""
+    """Options of a regenerator that runs code outside installed packages."""
 
     def named_code(self) -> str:
-        """Module or file that it runs; empty: none. A run folder that names some is gone on with only where it is
-        trusted."""
+        """Returns the module or file that it runs; empty: none. Runs with such code resume only in trusted folders."""
         ...
 
 
 @runtime_checkable
-class Refusing(Protocol):
-    """A regenerator that can say before training that it will not do."""
+class Checkable(Protocol):
+    """A regenerator that checks its requests before training."""
 
     def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
-        """Raise ConfigError or InputError if it cannot redraw these training views at these scales; `moved`: other
-        places are asked for as well."""
+        """Raises an error if it cannot regenerate these views at these scales.
+
+        Args:
+            views: Training views.
+            scales: Factors of the pictures' sides.
+            moved: True: other poses are rendered as well.
+
+        Raises:
+            ConfigError, InputError: it cannot.
+        """
         ...

@@ -1,4 +1,4 @@
-"""A run's model drawn for one camera, as it is now."""
+"""Renders of a run's current model."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from gsx.core.training.run import Run
 
 @torch.no_grad()
 def splats_for(run: Run, camera: Camera) -> Splats:
-    """The splats of a camera after the run's steps."""
+    """Returns the current splats for a camera."""
     return run.backbone.draw(camera, run.model_step).splats
 
 
@@ -25,7 +25,7 @@ def splats_for(run: Run, camera: Camera) -> Splats:
 def render_gaussians(
     gaussians: Gaussians, camera: Camera, raster: RasterSettings, background: Float[Tensor, "3"]
 ) -> Float[Tensor, "3 H W"]:
-    """The splats of a file by some rules, over a colour; colours clamped to [0, 1]."""
+    """Renders the Gaussians of a splat file over a colour; values clamped to [0, 1]."""
     splats = splats_of(gaussians, camera.centre)
     return rasterize_tiled(splats, camera, raster, background=background).image.clamp_(0, 1)
 
@@ -39,12 +39,16 @@ def render(
     splats: Splats | None = None,
     depth: bool = False,
 ) -> TiledRendering:
-    """The model after the run's steps, over the scene's background; colours clamped to [0, 1].
+    """Renders the current model over the scene's background; the result is on the CPU, clamped to [0, 1].
 
-    Rendered in windows of at most `pixels` px, so that memory does not grow with the picture; on the CPU. Rendered
-    `supersample` times as finely, and reduced; 0: as finely as training does. `splats`: instead of the model's own.
-    `depth`: with that, as finely as it was rendered; where something stands behind the scene (`Backdrop`), depth
-    and alpha are those of the scene alone: what shines through a wall does not move it away.
+    Args:
+        run: Run with the model.
+        camera: Camera of the picture.
+        pixels: Largest window rendered at once, px; bounds memory.
+        supersample: Factor of the render's resolution before reduction; 0: as in training.
+        splats: Splats instead of the model's own.
+        depth: True: with depth, at the render's resolution. With a `Backdrop`, depth and alpha are those of the splats
+            before it, so that a backdrop that shines through a wall does not move the wall.
     """
     times = supersample or times_as_fine(camera, run.scene.train, run.views.raster_scale(run.model_step))
     raster = finer_raster(camera, run.scene.reduction, times)
@@ -61,7 +65,7 @@ def render(
 def with_depth_of_scene(
     splats: Splats, far: Bool[Tensor, "M"], camera: Camera, run: Run, pixels: int
 ) -> TiledRendering:
-    """The picture, with depth and alpha of the splats that are not far away: these are drawn as two more colours."""
+    """Renders with depth and alpha of the near splats alone, blended as two more colours."""
     channels = replace(splats, colours=torch.cat([splats.colours, coverage_and_depth(splats, far, camera)], 1))
     background = torch.cat([run.background, run.background.new_zeros(2)])
     tiled = rasterize_tiled(channels, camera, run.raster, background=background, pixels=pixels)
@@ -69,6 +73,6 @@ def with_depth_of_scene(
 
 
 def coverage_and_depth(splats: Splats, far: Bool[Tensor, "M"], camera: Camera) -> Float[Tensor, "M 2"]:
-    """1 and camera z, scene units, of each splat, to be blended as colours are; 0 of those far away."""
+    """Returns (1, camera z in scene units) of each near splat and 0 of far ones, to be blended as colours."""
     near = (~far).to(splats.colours)[:, None]
     return torch.cat([near, near * camera.to_camera(splats.means)[:, 2:].to(near)], 1)

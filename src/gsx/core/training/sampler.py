@@ -1,4 +1,4 @@
-"""In which order training views are picked."""
+"""Order in which training views are picked."""
 
 from dataclasses import dataclass, field, replace
 
@@ -9,40 +9,41 @@ from gsx.core.seeds import derived_seed
 
 @dataclass(eq=False)
 class Sampler:
-    """Training views without replacement, reshuffled when all have been seen (3D-GS, train.py).
+    """Random order of training views without replacement, reshuffled after each pass (3D-GS, train.py).
 
-    Each order comes from the seed and its number alone, so that the next views are known.
+    Each order depends only on the seed and its number, so the next views are known in advance.
     """
 
     count: int
+    """Number of training views."""
     seed: int
     order: list[int] = field(default_factory=list)
-    """What is left of the current order, the next one last."""
-    begun: int = 0
-    """Orders begun so far."""
+    """Indices left in the current order, the next one last."""
+    orders: int = 0
+    """Number of orders drawn so far."""
     batch: int = 1
-    """Views of one step."""
-    taken: list[int] = field(default_factory=list)
-    """Those of the step under way."""
+    """Views per step."""
+    current: list[int] = field(default_factory=list)
+    """Indices of the views of the current step."""
 
     def take(self) -> list[int]:
-        """Indices of the views of the next step, in order."""
-        self.taken = [self.next() for _ in range(self.batch)]
-        return self.taken
+        """Returns the indices of the views of the next step, in order."""
+        self.current = [self.next() for _ in range(self.batch)]
+        return self.current
 
     def put_back(self) -> None:
-        """Undo `take`: the same views come next again."""
-        self.order += reversed(self.taken)
-        self.taken = []
+        """Undoes `take`: the same views come next again."""
+        self.order += reversed(self.current)
+        self.current = []
 
     def next(self) -> int:
-        """Index of the next view."""
+        """Returns the index of the next view."""
         if not self.order:
-            generator = torch.Generator().manual_seed(derived_seed("views", self.seed, self.begun))
-            self.order, self.begun = torch.randperm(self.count, generator=generator).tolist(), self.begun + 1
+            generator = torch.Generator().manual_seed(derived_seed("views", self.seed, self.orders))
+            self.order, self.orders = torch.randperm(self.count, generator=generator).tolist(), self.orders + 1
         return self.order.pop()
 
     def coming(self, steps: int) -> set[int]:
-        """Indices of the views of the next steps."""
+        """Returns the indices of the views of the next steps."""
         ahead = replace(self, order=list(self.order))
         return {ahead.next() for _ in range(steps * self.batch)}

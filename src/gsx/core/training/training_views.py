@@ -1,4 +1,4 @@
-"""Training views at each step: scale, corrected pose and mask, and how their photos would show a render."""
+"""Training views at each step: scale, corrected pose and mask; corrections of renders to match their photos."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,19 +10,19 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
 from gsx.core.shapes import Float
-from gsx.core.training.finer_raster import FinerRaster, raster_at
+from gsx.core.training.finer_raster import FinerRaster, finer_raster, times_as_fine
 from gsx.core.training.module import Modules, TrainingModule
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainingViews:
-    """Training views of a scene, as the modules of a run change them."""
+    """Training views of a scene, changed by the modules of a run."""
 
     scene: Scene
     modules: Modules = field(default_factory=dict)
 
     def without(self, module: TrainingModule) -> "TrainingViews":
-        """Returns the views as all other modules change them."""
+        """Returns the views without the changes of one module."""
         others = {name: other for name, other in self.modules.items() if other is not module}
         return replace(self, modules=others)
 
@@ -32,7 +32,7 @@ class TrainingViews:
         return self._transformed(None)
 
     def at(self, step: int) -> Sequence[View]:
-        """Returns the training views as a step sees them."""
+        """Returns the training views of a step."""
         return self._transformed(step)
 
     def _transformed(self, step: int | None) -> Sequence[View]:
@@ -50,29 +50,29 @@ class TrainingViews:
         *,
         learning: bool = False,
     ) -> Float[Tensor, "3 H W"]:
-        """Returns a render of a training view, or of a window of it, as its photo would show it.
+        """Applies the modules' corrections to a render, so that it can be compared with the photo.
 
-        photo: what it is to be compared with; None: it is to be looked at. learning: a step is under way.
+        For the arguments see `TrainingModule.transform_render`.
         """
         for module in reversed([*self.modules.values()]):
             image = module.transform_render(image, view, photo, window, learning)
         return image
 
     def raster_scale(self, step: int) -> int:
-        """Returns how many times as fine as photos the renders of a step are."""
+        """Returns the factor by which renders of a step are finer than the photos."""
         return math.prod(module.raster_scale(step) for module in self.modules.values())
 
     def raster_for(self, step: int) -> Callable[[Camera], FinerRaster]:
-        """Returns the raster of a camera, by the rules of a step."""
-        scale = self.raster_scale(step)
-        return lambda camera: raster_at(camera, self.scene, scale)
+        """Returns a function from a camera to its raster at a step."""
+        scene, scale = self.scene, self.raster_scale(step)
+        return lambda camera: finer_raster(camera, scene.reduction, times_as_fine(camera, scene.train, scale))
 
     def raster_cameras(self, step: int) -> list[Camera]:
-        """Returns the cameras by which a step renders training views."""
+        """Returns the cameras of the training renders of a step."""
         scale = self.raster_scale(step)
         return [view.camera.zoom(scale) for view in self.at(step)]
 
     def changes_after(self, step: int) -> bool:
-        """Returns whether the step after this one renders other cameras."""
+        """Returns whether the next step renders other cameras."""
         finer = self.raster_scale(step) != self.raster_scale(step + 1)
         return step > 0 and (finer or self.at(step) is not self.at(step + 1))

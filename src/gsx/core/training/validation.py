@@ -1,4 +1,4 @@
-"""Windows of training views that count in no loss for a while, and the gain in dB that they measure."""
+"""Validation windows: parts of training views that are kept out of the loss, and the gain in dB measured on them."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from gsx.core.training.importance import rounding_of
 def validation_windows(
     views: Sequence[View], count: int, share: float, purpose: str, number: int
 ) -> dict[View, Window]:
-    """Picks windows with a share of the sides of `count` views, by purpose and number alone, not by the run's seed."""
+    """Picks windows with a share of the sides of `count` views; depends on purpose and number alone."""
     generator = torch.Generator().manual_seed(derived_seed(purpose, number))
     order = torch.randperm(len(views), generator=generator)[:count].tolist()
     corners = torch.rand(len(order), 2, generator=generator).tolist()
@@ -25,19 +25,19 @@ def validation_windows(
 
 
 def part_of(view: View, share: float, right: float, down: float) -> Window:
-    """Returns a window with a share of a view's sides; its place from 0 (left, top) to 1."""
+    """Returns a window with a share of a view's sides; `right`, `down`: its place from 0 to 1."""
     width, height = (max(1, round(share * side)) for side in view.camera.size)
     left, top = round(right * (view.camera.width - width)), round(down * (view.camera.height - height))
     return Window(left, top, width, height)
 
 
 def rounding_in(windows: Mapping[View, Window]) -> Float[Tensor, "W"]:
-    """Returns the squared error of rounding to 8 bits in each window, over values that count; 0 if all are masked."""
+    """Returns the squared error of rounding photos to 8 bits in each window; masked pixels count 0."""
     return torch.tensor([rounding_of(view, window) for view, window in windows.items()])
 
 
 def decibels(after: Float[Tensor, "W"], before: Float[Tensor, "W"]) -> tuple[float, float]:
-    """Returns (gain in dB by squared errors `before` and `after`, its standard error); (0, inf) without windows."""
+    """Returns the gain in dB from errors `before` to `after`, and its standard error; (0, inf) without windows."""
     if not bool(before.any()):
         return 0.0, math.inf
     gain = 10 * math.log10(float(before.sum() / after.sum()))

@@ -55,7 +55,7 @@ def write(run: Run, folder: Path) -> Path:
         "step": run.step,
         "seconds": run.progress.seconds,
         "sampler": run.sampler.order,
-        "orders": run.sampler.begun,
+        "orders": run.sampler.orders,
         "views": names_of(run),
         "origin": run.scene.origin,
         "sha256": hashlib.sha256(data).hexdigest(),
@@ -185,6 +185,6 @@ def restore(run: Run, training: bool = False) -> None:
     run.backbone.table = restored_table(run.backbone.table, tensors)
     run.step, run.progress.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])
-    run.sampler.begun = meta.get("orders", -(-run.step // run.sampler.count))  # gsx before orders were counted
+    run.sampler.orders = meta.get("orders", -(-run.step // run.sampler.count))  # gsx before orders were counted
     for sidecar in damaged if training and run.ranks.first else ():
         sidecar.rename(sidecar.with_suffix(".damaged"))

@@ -33,7 +33,7 @@ from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.halves import Anew, held_out_renders
 from gsx.experiments.runs.rasterizer_path import decide
 from gsx.experiments.runs.settings import Chosen, Settings
-from gsx.experiments.runs.start_file import go_on_from, in_front_of, one_point
+from gsx.experiments.runs.start_file import in_front_of, one_point, start_from
 
 logger = logging.getLogger(__name__)
 
@@ -180,7 +180,7 @@ def build(
         stand_in = in_front_of(scene.train[0].camera)
         one = replace(scene, points=one_point(stand_in))
         backbone = anew(one, general.iterations, generator, views, ranks, begins=False)
-        go_on_from(backbone, start or stand_in, settings.backbone.component.name)
+        start_from(backbone, start or stand_in, settings.backbone.component.name)
     else:
         backbone = anew(scene, general.iterations, generator, views, ranks, begins)
     return Run(

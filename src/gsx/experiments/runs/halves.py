@@ -64,7 +64,7 @@ def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h
     begun, views = time.perf_counter(), run.train_views
     shown: dict[int, Tensor] = {}
     for half in range(HALVES):
-        model = trained(without(run, anew, half, steps, seed), run.refuse_if_stopping)
+        model = trained(without(run, anew, half, steps, seed), run.raise_if_stopping)
         numbers = range(half, len(views), HALVES)
         shown |= {n: to_uint8(run.as_photo(render(model, views[n].camera).image, views[n])) for n in numbers}
     logger.info("each has rendered the views that it does not know, %.0f s", time.perf_counter() - begun)
@@ -97,10 +97,10 @@ def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
     )
 
 
-def trained(run: Run, refuse_if_stopping: Callable[[], None]) -> Run:
+def trained(run: Run, raise_if_stopping: Callable[[], None]) -> Run:
     """The run at its end; nobody but the guard against numbers that are not finite listens.
 
-    `refuse_if_stopping`: of the run that it is trained for.
+    `raise_if_stopping`: of the run that it is trained for.
 
     Raises:
         TrainingError: it was lost; the run that it is trained for is not.
@@ -108,7 +108,7 @@ def trained(run: Run, refuse_if_stopping: Callable[[], None]) -> Run:
     plugins = load_plugins([], points=[])
     with plugins.listening([Guard()]):
         while not run.complete:
-            refuse_if_stopping()
+            raise_if_stopping()
             try:
                 train_step(run, plugins)
             except LostModel as error:

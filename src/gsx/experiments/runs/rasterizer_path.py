@@ -10,7 +10,7 @@ import torch
 from gsx.core.errors import first_line
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
-from gsx.core.rasterizer.compositor import Demanding
+from gsx.core.rasterizer.compositor import Restricted
 from gsx.core.training.backbone import WithHarmonics
 from gsx.core.training.run import Run
 from gsx.engine.compile_ahead import Step, compile_ahead, warm_camera, warm_splats
@@ -23,7 +23,7 @@ def decide(settings: RasterSettings, steps: int, device: torch.device) -> Raster
     """Replaces path=auto for a training run of `steps` by eager or compiled, and logs the reason."""
     if settings.path != "auto":
         compositor = settings.compositors.get(settings.compositor_name)
-        if isinstance(compositor, Demanding):
+        if isinstance(compositor, Restricted):
             compositor.refuse(settings, device)
         return settings
     long_enough = steps >= settings.auto_steps

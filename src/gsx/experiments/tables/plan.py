@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from gsx.core.errors import ConfigError, nearest
 from gsx.core.ranges import LARGEST_SEED, Range
-from gsx.core.training.augmenter import Foretold
+from gsx.core.training.augmenter import KnownStart
 from gsx.engine.cache import content_key
 from gsx.experiments.run_folder.files import read_run
 from gsx.experiments.run_folder.run_key import finished, place_of, scene_stamp, sorted_items, trained
@@ -104,7 +104,7 @@ class Cell:
     def begins(self) -> int:
         """Counts the steps in common with a run without augmenters; 0 where an augmenter does not foretell it."""
         iterations, options = self.settings.general.iterations, [a.options for a in self.settings.augmenters.values()]
-        begins = [option.begins(iterations) if isinstance(option, Foretold) else 0 for option in options]
+        begins = [option.begins(iterations) if isinstance(option, KnownStart) else 0 for option in options]
         return min([iterations, *begins])
 
     @property

@@ -247,7 +247,7 @@ def learn(
     progress = Pace(f"{options.name} is tuned", tuning.steps)
     with as_trained(pipe.unet, tuning.checkpointing):
         for step in range(tuning.steps):
-            context.refuse_if_stopping()
+            context.raise_if_stopping()
             if tuning.seconds and progress.seconds > tuning.seconds:
                 logger.warning("%s is tuned for %d of %d steps: tuning.seconds", options.name, step, tuning.steps)
                 return False
