@@ -23,7 +23,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError, command
-from gsx.core.files import at_home
+from gsx.core.files import expand_home
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.ranges import ZOOMS
 from gsx.core.rasterizer import RasterSettings
@@ -217,7 +217,7 @@ def load(
         InputError: it is neither, or damaged; or `raster`, `origin` or `axes` are set for a run, which has its own.
         CheckpointError: the run has no usable checkpoint.
     """
-    path = splat_file_at(at_home(path))
+    path = splat_file_at(expand_home(path))
     if path.is_dir():
         for name, given in {"raster": raster is not None, "origin": any(origin), "axes": axes != AUTO}.items():
             if given:

@@ -1,7 +1,8 @@
 """Every number that an option holds has a range, and beyond it is refused by name."""
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import pytest
 
@@ -9,7 +10,7 @@ from gsx.augmenters.checks import Checks
 from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
 from gsx.core.options import flattened
-from gsx.core.ranges import Range, Share, beyond_range, without_range
+from gsx.core.ranges import Range, Share, beyond_range, field_ranges, parts_of
 from gsx.core.rasterizer import RasterOptions
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.eval_options import EvalOptions
@@ -38,6 +39,16 @@ class Outer:
     either: Annotated[int, Range(1, 3)] | None = None
     named: Annotated[dict[str, int], Range(1, 3)] = field(default_factory=lambda: {"a": 1})
     switch: bool = False
+
+
+def without_range(options: type, prefix: str = "") -> Iterator[str]:
+    """Yields the dotted keys of numeric fields without a range."""
+    hints = get_type_hints(options, include_extras=True)
+    for name, (kinds, bounds) in field_ranges(options).items():
+        for inner in kinds:
+            yield from without_range(inner, f"{prefix}{name}.")
+        if bounds is None and any(part in (int, float) for part in parts_of(hints[name])):
+            yield f"{prefix}{name}"
 
 
 def test_numbers_beyond_their_range_are_found_in_lists_and_below() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from gsx.builtin import plugins
 from gsx.cli.train import verb_train
 from gsx.core.errors import ConfigError, command
-from gsx.core.files import at_home
+from gsx.core.files import expand_home
 from gsx.core.plugins import Plugins
 from gsx.engine.collector import loading
 
@@ -16,12 +16,12 @@ logger = logging.getLogger("gsx.cli")
 
 def is_given(word: str) -> bool:
     """Returns whether a word of the command line is a folder or file."""
-    return at_home(word).exists()
+    return expand_home(word).exists()
 
 
 def train_from(arguments: list[str]) -> int:
     """gsx FOLDER|VIDEO [KEY=VALUE ...]: trains from it, as whatever it is."""
-    path, overrides = at_home(arguments[0]), arguments[1:]
+    path, overrides = expand_home(arguments[0]), arguments[1:]
     odd = next((word for word in overrides if "=" not in word or word.startswith(("scene=", "scene.path="))), "")
     if odd:
         raise ConfigError(f"gsx {arguments[0]}: '{odd}' does not go with it: it says itself what scene it is")

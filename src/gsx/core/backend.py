@@ -1,6 +1,6 @@
-"""How kernels run, functions of tensors that rendering and losses consist of: here as plain torch.
+"""Backends that run kernels: the tensor functions of rendering and losses. This one runs them in plain torch.
 
-A compositor may bring a backend that compiles them (`gsx.engine`). Whoever calls a kernel asks the backend for it.
+A compositor may bring a backend that compiles them (`gsx.engine`).
 """
 
 from collections.abc import Callable
@@ -8,25 +8,28 @@ from typing import Any
 
 
 class Backend:
-    """Runs kernels as they stand; the base class of backends that compile them."""
+    """Backend in plain torch; base class of backends that compile kernels."""
 
     compiled = False
-    """Whether kernels are compiled: some have a form for compilers, and another for eager torch."""
+    """True: kernels are compiled; some have one form for compilers and another for eager torch."""
 
     def available(self, device: str) -> bool:
-        """Returns whether kernels can run this way on a kind of device."""
+        """Returns whether the backend works on a kind of device."""
         return True
 
     def on(self, device: str, learning: bool = False) -> "Backend":
-        """Returns the backend for a kind of device; `learning`: for kernels that are compiled with gradients only."""
+        """Returns the backend for a kind of device; `learning`: True for kernels with gradients."""
         return self
 
     def kernel(self, function: Callable[..., Any], *last: Any, variant: tuple[Any, ...] = ()) -> Callable[..., Any]:
-        """Returns `function` with these values of its last arguments; `variant`: of the others, what changes the code.
+        """Binds the last arguments of a function. Compiled kernels need at least two rows.
 
-        Compiled kernels take at least two rows.
+        Args:
+            function: Kernel.
+            last: Values of its last arguments, constants of the compiled code.
+            variant: Properties of the other arguments that need code of their own.
         """
-        return (lambda *given: function(*given, *last)) if last else function
+        return (lambda *first: function(*first, *last)) if last else function
 
 
 EAGER = Backend()

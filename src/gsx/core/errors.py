@@ -1,4 +1,4 @@
-"""Errors a user can act on: one sentence that names value, place and remedy. The command line exits with 2 on them."""
+"""Errors that a user can act on. The message names value, place and remedy; the command line exits with status 2."""
 
 import difflib
 import shlex
@@ -6,56 +6,56 @@ from collections.abc import Iterable
 
 
 class GsxError(Exception):
-    """Base of every error that is the user's to mend; its message is shown without a traceback."""
+    """Base class; the message is printed without a traceback."""
 
 
 class ConfigError(GsxError):
-    """A key, value or group of the configuration is wrong."""
+    """Wrong key, value or group in the configuration."""
 
 
 class InputError(GsxError):
-    """A file or folder given to gsx cannot be used."""
+    """Unusable file, folder or argument."""
 
 
 class CompilerError(GsxError):
-    """What was compiled on this machine before cannot be now: a full disk, or a compiler that was killed."""
+    """Failure of a compilation that worked before, as by a full disk or a killed compiler."""
 
 
 class TooManyPairs(InputError):
-    """A picture needs more splat-tile pairs than `rasterizer.max_pairs`; smaller pieces of it may not."""
+    """More splat-tile pairs in a picture than `rasterizer.max_pairs`; smaller windows of it may work."""
 
 
 class CheckpointError(GsxError):
-    """A checkpoint is missing, truncated or altered."""
+    """Missing, truncated or altered checkpoint."""
 
 
 class TrainingError(GsxError):
-    """Training cannot go on, for example after three non-finite steps in a row."""
+    """End of a training that cannot continue, as after three non-finite steps in a row."""
 
 
 class Stopped(GsxError):
-    """A step was given up because its run was asked to stop; the run stands where the step began."""
+    """End of a step before it changed anything, because the run is stopping."""
 
 
 class LostModel(TrainingError):
-    """What is left of a model is another one, which may not become a checkpoint."""
+    """Loss of so many primitives that the model must not be saved."""
 
 
 class Disagreement(LostModel):
-    """The processes of one run hold different models."""
+    """Different models in the processes of one run."""
 
 
 def nearest(word: str, options: Iterable[str]) -> str:
-    """` Did you mean 'x'?` for the closest option, or an empty string when nothing is close."""
+    """Returns ` Did you mean 'x'?` with the closest option; empty: none is close."""
     close = difflib.get_close_matches(word, list(options), n=1, cutoff=0.5)
     return f" Did you mean '{close[0]}'?" if close else ""
 
 
 def command(*words: object) -> str:
-    """`gsx` with these words, as a shell takes it: for what is to be copied."""
+    """Returns the `gsx` command with these words, quoted for a shell."""
     return shlex.join(["gsx", *map(str, words)])
 
 
 def first_line(error: BaseException) -> str:
-    """First line of an error's message."""
+    """Returns the first line of an error's message."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]

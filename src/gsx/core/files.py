@@ -1,4 +1,4 @@
-"""Files that are either wholly there or not at all, JSON and CSV."""
+"""Atomic writes, temporary files, JSON and CSV."""
 
 import csv
 import io
@@ -20,16 +20,16 @@ from gsx.core.errors import InputError
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path`, same suffix; it becomes `path` when the block ends, or vanishes on an error.
+    """Yields a temporary path with the same folder and suffix; renames it to `path`, or deletes it on an error.
 
-    Its name says who writes it, and is drawn besides: containers share names of machines and numbers of processes.
+    Its name holds machine and process, and random digits, since containers share both.
     """
-    temporary = path.with_name(f".{path.stem}.{own_mark()}-{secrets.token_hex(4)}.partial{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.{process_tag()}-{secrets.token_hex(4)}.partial{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        if error.filename == str(temporary):  # nobody knows that name
+        if error.filename == str(temporary):  # report the name that the user knows
             error.filename = str(path)
         raise
     finally:
@@ -37,24 +37,24 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def replace_file(path: Path, content: bytes) -> None:
-    """Write a file at once, and onto the disk before it takes the place of an older one; then its name, too."""
+    """Writes a file atomically; content and name are on the disk at the end."""
     with replacing(path) as temporary, temporary.open("wb") as stream:
         stream.write(content)
         stream.flush()
         os.fsync(stream.fileno())
-    keep_names(path.parent)
+    sync_folder(path.parent)
 
 
 def replace_text(path: Path, text: str) -> None:
-    """`replace_file` as UTF-8; bytes of file names that are no text, which Python has as surrogates, become escapes."""
+    """Writes UTF-8 text by `replace_file`; surrogates of undecodable file names become escapes."""
     replace_file(path, text.encode("utf-8", "backslashreplace"))
 
 
-def keep_names(folder: Path) -> None:
-    """Have the disk keep what a folder's files are called now, where a system lets folders be written through."""
+def sync_folder(folder: Path) -> None:
+    """Flushes the names in a folder to the disk, where the system can."""
     if not hasattr(os, "O_DIRECTORY"):
         return
-    with suppress(OSError):  # file systems that know no such thing
+    with suppress(OSError):  # file systems without this call
         number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(number)
@@ -63,22 +63,22 @@ def keep_names(folder: Path) -> None:
 
 
 ABANDONED = 3600.0
-"""Seconds after which a temporary file of another machine is taken for left behind."""
+"""Age in seconds at which temporary files of other machines are deleted."""
 MARKED = re.compile(r"^\..+\.(?P<machine>[A-Za-z0-9]*)-(?P<process>\d+)-[0-9a-z_]{8}\.partial")
 """Names of temporary files."""
 
 
-def own_mark() -> str:
-    """This machine and process, in letters of file names; containers that number processes anew are told apart."""
+def process_tag() -> str:
+    """Returns an identifier of machine, container and process, for file names."""
     try:
-        counted_by = os.readlink("/proc/self/ns/pid")  # of containers each has its own
+        counted_by = os.readlink("/proc/self/ns/pid")  # differs between containers
     except OSError:
         counted_by = ""
     return f"{re.sub(r'[^A-Za-z0-9]', '', platform.node() + counted_by)}-{os.getpid()}"
 
 
-def at_home(path: str | Path) -> Path:
-    """A path with `~` and `~user` as what they stand for; as it is where there is no such user."""
+def expand_home(path: str | Path) -> Path:
+    """Expands `~` and `~user` in a path, unless there is no such user."""
     try:
         return Path(path).expanduser()
     except RuntimeError:
@@ -86,7 +86,7 @@ def at_home(path: str | Path) -> Path:
 
 
 def remove_partial(folder: Path, below: bool = True) -> None:
-    """Remove what killed processes left half-written in a folder, and below it."""
+    """Deletes temporary files of ended processes in a folder and, if `below`, in its subfolders."""
     for place, inner, names in os.walk(folder):
         for name in (*names, *inner):
             if found := MARKED.match(name):
@@ -99,8 +99,8 @@ def remove_partial(folder: Path, below: bool = True) -> None:
 
 
 def gone(machine: str, process: int, path: Path) -> bool:
-    """Whether the process that wrote a temporary file is no more; of other machines its age tells."""
-    if machine != own_mark().rpartition("-")[0] or os.name != "posix":
+    """Returns whether the writer of a temporary file has ended; on other machines, whether the file is old."""
+    if machine != process_tag().rpartition("-")[0] or os.name != "posix":
         return time.time() - path.stat().st_mtime > ABANDONED
     try:
         os.kill(process, 0)
@@ -112,7 +112,7 @@ def gone(machine: str, process: int, path: Path) -> bool:
 
 
 def file_count(folder: Path) -> int:
-    """Files of a folder that are not hidden; none where it cannot be looked at."""
+    """Returns the number of visible files in a folder; 0 if it cannot be read."""
     try:
         return sum(path.is_file() and not path.name.startswith(".") for path in folder.iterdir())
     except OSError:
@@ -129,7 +129,7 @@ def csv_text(fields: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def finite(content: Any) -> Any:
-    """The same with infinite and undefined numbers as None, for which JSON has a word."""
+    """Replaces inf and NaN by None, for JSON."""
     if isinstance(content, dict):
         return {key: finite(value) for key, value in content.items()}
     if isinstance(content, list | tuple):
@@ -138,39 +138,35 @@ def finite(content: Any) -> Any:
 
 
 LFS_POINTER = b"version https://git-lfs"
-"""First bytes of the small text that stands in for a file until Git LFS downloads it."""
+"""First bytes of the pointer that Git LFS leaves in place of a file."""
 LFS_REMEDY = "a Git LFS pointer, not the file itself: run 'git lfs pull' in its repository"
 
 
 def is_lfs_pointer(path: Path) -> bool:
-    """Recognise a file that Git LFS has not downloaded yet."""
+    """Returns whether a file is a pointer that Git LFS has not resolved."""
     with suppress(OSError), path.open("rb") as stream:
         return stream.read(len(LFS_POINTER)) == LFS_POINTER
     return False
 
 
 def refuse_lfs_pointer(path: Path) -> None:
-    """Raise InputError for a file that Git LFS has not downloaded yet."""
+    """Raises InputError for a pointer that Git LFS has not resolved."""
     if is_lfs_pointer(path):
         raise InputError(f"'{path}' is {LFS_REMEDY}.")
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file; a name that none can have, as too long a one, is that of none."""
+    """Returns whether a file exists; False for impossible names, where `Path.is_file` may raise."""
     return os.path.isfile(path)
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON; numbers that are not finite become null, unknown objects text."""
+    """Writes JSON; inf and NaN become null, unknown objects text."""
     replace_file(path, json.dumps(finite(content), indent=2, default=str).encode())
 
 
 def read_json(path: Path) -> Any:
-    """Return what a JSON file holds, in UTF-8, UTF-16 or UTF-32, with or without a byte order mark.
-
-    Raises:
-        OSError, ValueError: it cannot be read or parsed.
-    """
+    """Reads JSON in UTF-8, -16 or -32, with or without a byte order mark; OSError, ValueError: it is unreadable."""
     try:
         return json.loads(path.read_bytes())
     except RecursionError as error:

@@ -1,7 +1,6 @@
-"""What options say of themselves beside their values: whether they have any effect on results. Dotted keys.
+"""Metadata of option fields: whether they change results.
 
-A run is named by what it trains. Fields made by `without_effect` and `label` do not count for that name, in options of
-plugins just as in those of gsx itself.
+Fields made by `without_effect` and `label` do not enter the hash in a run's name, in gsx and in plugins.
 """
 
 from collections.abc import Mapping
@@ -12,17 +11,17 @@ EFFECT = "effect"
 
 
 def without_effect(**default: Any) -> Any:
-    """A field that changes no result: where something lies, with which means it is computed, how often it is told."""
+    """Returns a field that changes no result: a path, a memory limit, a logging interval."""
     return field(metadata={EFFECT: "none"}, **default)
 
 
 def label(**default: Any) -> Any:
-    """A field that only names what other fields hold."""
+    """Returns a field that only names the content of other fields."""
     return field(metadata={EFFECT: "label"}, **default)
 
 
 def fields_with(effect: str, options: type, prefix: str = "") -> frozenset[str]:
-    """Dotted names of the fields of a dataclass, and of those inside it, that say this of their effect."""
+    """Returns the dotted names of all fields, also nested ones, with this effect."""
     found = {f"{prefix}{entry.name}" for entry in fields(options) if entry.metadata.get(EFFECT) == effect}
     for name, hint in get_type_hints(options).items():
         for kind in (hint, *get_args(hint)):
@@ -32,7 +31,7 @@ def fields_with(effect: str, options: type, prefix: str = "") -> frozenset[str]:
 
 
 def flattened(node: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Values of a nested configuration by dotted key."""
+    """Returns the values of a nested configuration by dotted key."""
     out: dict[str, Any] = {}
     for key, value in node.items():
         out |= flattened(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}

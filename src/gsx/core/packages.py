@@ -1,4 +1,4 @@
-"""Optional packages: there, or an error with the remedy."""
+"""Optional packages."""
 
 from collections.abc import Sequence
 from importlib import import_module
@@ -8,7 +8,7 @@ from gsx.core.errors import ConfigError, first_line
 
 
 def require(what: str, packages: Sequence[str], extra: str) -> None:
-    """Raise ConfigError if a package is not installed, or cannot be imported; `extra`: what pip is to install."""
+    """Raises ConfigError, with the pip command for `extra`, if a package is missing or cannot be imported."""
     missing = [package for package in packages if find_spec(package.partition(".")[0]) is None]
     if missing:
         raise ConfigError(f"{what} needs {', '.join(missing)}: pip install '{extra}'")

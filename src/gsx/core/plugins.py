@@ -1,8 +1,8 @@
-"""The doors of gsx: hook specifications, the registry they fill, and discovery of installed plugins.
+"""Hook specifications, the component registry, and discovery of installed plugins.
 
-Built-ins come in through the same hooks as third parties. A third party ships a wheel with an entry point in group
-`gsx` that names a module or object implementing hooks (docs/how-to/write-a-plugin.md). A plugin that fails to load is
-reported by `gsx plugins` and at the start of a run, and everything else goes on.
+A plugin is a package with an entry point in group `gsx` that names a module or object with hooks
+(docs/how-to/write-a-plugin.md). Built-in components use the same hooks. A plugin that fails to load is reported by
+`gsx plugins` and at the start of a run; everything else works.
 """
 
 import os
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 GROUP = "gsx"
 """Entry-point group and pluggy project name."""
 BLOCK = "GSX_NO_PLUGINS"
-"""Environment variable: when set and not empty, only built-ins are loaded."""
+"""Environment variable; if set and not empty, only built-ins are loaded."""
 KINDS = ("scene", "backbone", "module", "augmenter", "regenerator", "tracker", "compositor")
 
 hookspec = pluggy.HookspecMarker(GROUP)
@@ -32,17 +32,17 @@ hookimpl = pluggy.HookimplMarker(GROUP)
 
 @dataclass(frozen=True)
 class Component:
-    """Something a configuration can name: `<kind>.name: <name>`."""
+    """Component that a configuration names by `<kind>.name: <name>`."""
 
     kind: str
     name: str
     factory: Callable[..., Any]
     options: type
-    """Dataclass of its configuration: types and keys; a YAML file in conf/<kind>/ gives the values."""
+    """Dataclass with keys and types of its configuration; a YAML file in conf/<kind>/ holds the values."""
     provider: str
-    """Plugin it came from."""
+    """Plugin that registered it."""
     scene_format: SceneFormat | None = None
-    """Of a scene loader: how it tells its folders, if it reads any."""
+    """Format of a scene loader that reads folders."""
 
 
 @dataclass
@@ -51,97 +51,97 @@ class Registry:
 
     components: dict[tuple[str, str], Component] = field(default_factory=dict)
     provider: str = "gsx"
-    """Plugin that is registering at the moment."""
+    """Plugin that is registering now."""
 
     def add(
-        self,
-        kind: str,
-        name: str,
-        factory: Callable[..., Any],
-        options: type,
-        scene_format: SceneFormat | None = None,
+        self, kind: str, name: str, factory: Callable[..., Any], options: type, scene_format: SceneFormat | None = None
     ) -> None:
-        """Register a component; `scene_format`: see `Component`.
+        """Registers a component.
+
+        Args:
+            kind: One of `KINDS`.
+            name: Name in configurations.
+            factory: Returns the component from an instance of `options` and, for some kinds, a context.
+            options: Dataclass of its configuration.
+            scene_format: Format of a scene loader that reads folders.
 
         Raises:
-            ConfigError: the kind is unknown or the name is taken.
+            ConfigError: the kind is unknown or the name is in use.
         """
         if kind not in KINDS:
             raise ConfigError(
-                f"'{kind}' is no kind of component; choose from {', '.join(KINDS)}.{nearest(kind, KINDS)}"
+                f"'{kind}' is not a kind of component; choose from {', '.join(KINDS)}.{nearest(kind, KINDS)}"
             )
         if (kind, name) in self.components:
-            taken = self.components[kind, name].provider
-            raise ConfigError(f"{kind} '{name}' is already registered by {taken}; choose another name")
+            other = self.components[kind, name].provider
+            raise ConfigError(f"{kind} '{name}' is already registered by {other}; choose another name")
         self.components[kind, name] = Component(kind, name, factory, options, self.provider, scene_format)
 
     def formats(self) -> list[tuple[Component, SceneFormat]]:
-        """Scene loaders that read folders, the latest first: plugins before what ships with gsx."""
+        """Returns scene loaders that read folders, with their formats, plugins before built-ins."""
         scenes = [component for component in self.components.values() if component.kind == "scene"]
         return [(scene, scene.scene_format) for scene in reversed(scenes) if scene.scene_format is not None]
 
     def names(self, kind: str) -> list[str]:
-        """Names of a kind, sorted."""
+        """Returns the names of a kind, sorted."""
         return sorted(name for k, name in self.components if k == kind)
 
     def of(self, kind: str) -> dict[str, Component]:
-        """Components of a kind by name, in the order in which they were registered."""
+        """Returns the components of a kind by name, in the order of their registration."""
         return {name: component for (k, name), component in self.components.items() if k == kind}
 
     def find(self, kind: str, name: str) -> Component:
-        """The component, or ConfigError with the nearest name."""
-        if (kind, name) not in self.components:
-            options = self.names(kind)
-            raise ConfigError(
-                f"{kind}.name is '{name}', which no installed plugin provides; "
-                f"there are: {', '.join(options) or 'none'}.{nearest(name, options)}"
-            )
-        return self.components[kind, name]
+        """Returns a component; ConfigError: there is none, with the nearest name."""
+        if (kind, name) in self.components:
+            return self.components[kind, name]
+        names = self.names(kind)
+        known = f"there are: {', '.join(names) or 'none'}.{nearest(name, names)}"
+        raise ConfigError(f"{kind}.name is '{name}', which no installed plugin provides; {known}")
 
 
 class Hooks:
-    """The whole plugin interface. Implementations may take fewer arguments than listed here."""
+    """Hooks of the plugin interface; an implementation may take fewer of the arguments."""
 
     @hookspec
     def gsx_register(self, registry: Registry) -> None:
-        """Called once at start-up: add components with `registry.add(kind, name, factory, options)`."""
+        """Registers components by `registry.add(kind, name, factory, options)`; called once at start-up."""
 
     @hookspec
     def gsx_config_paths(self) -> list[str]:  # type: ignore[empty-body]
-        """Extra Hydra search paths with configuration groups, for example ['pkg://your_package.conf']."""
+        """Returns Hydra search paths with configuration groups, such as ['pkg://your_package.conf']."""
 
     @hookspec
     def gsx_run_started(self, run: "Run") -> None:
-        """The scene and backbone are built (and restored, when resuming); training is about to begin."""
+        """Runs before the first step, with scene and backbone built or restored."""
 
     @hookspec(firstresult=True)
     def gsx_gradients_ready(self, run: "Run", step: "StepResult") -> str | None:
-        """After the backward pass, before anything changes: return a reason to skip this step, else None."""
+        """Runs after the backward pass, before any update; returns a reason to skip this step, or None."""
 
     @hookspec
     def gsx_step_finished(self, run: "Run", step: "StepResult") -> None:
-        """One training step is done."""
+        """Runs after each step."""
 
     @hookspec
     def gsx_evaluated(self, run: "Run", evaluation: dict[str, Any]) -> None:
-        """An evaluation on held-out views is done; `evaluation` is what evaluation.json holds."""
+        """Runs after an evaluation on held-out views; `evaluation` is the content of evaluation.json."""
 
     @hookspec
     def gsx_training_finished(self, run: "Run") -> None:
-        """The loop has ended, complete or interrupted (`run.complete` says which); nothing is evaluated yet."""
+        """Runs after the last step, before the evaluation; `run.complete` is False for an interrupted run."""
 
     @hookspec
     def gsx_run_finished(self, run: "Run") -> None:
-        """Everything of the run is on disk."""
+        """Runs when all files of the run are written."""
 
     @hookspec
     def gsx_run_failed(self, run: "Run", reason: str) -> None:
-        """Training or what follows it ended with an error, or with a second Ctrl-C (KeyboardInterrupt: ...)."""
+        """Runs after an error in training or evaluation, or a second Ctrl-C (KeyboardInterrupt: ...)."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A plugin that could not be loaded."""
+    """Plugin that failed to load."""
 
     plugin: str
     reason: str
@@ -149,7 +149,7 @@ class Failure:
 
 @dataclass
 class Plugins:
-    """Loaded plugins: the pluggy manager that emits events, the registry, and what failed."""
+    """Loaded plugins: the pluggy manager that calls hooks, the registry, and failures."""
 
     manager: pluggy.PluginManager
     registry: Registry
@@ -161,12 +161,12 @@ class Plugins:
 
     @property
     def emit(self) -> pluggy.HookRelay:
-        """Hook calls by name: `plugins.emit.gsx_step_finished(run=run, step=step)`."""
+        """Hooks by name: `plugins.emit.gsx_step_finished(run=run, step=result)`."""
         return self.manager.hook
 
     @contextmanager
     def listening(self, listeners: Iterable[object]) -> Iterator[None]:
-        """Objects with event hooks listen for the duration of a run; the first listed is called first."""
+        """Registers objects with event hooks inside the block; the first is called first."""
         registered = list(listeners)
         for listener in reversed(registered):  # pluggy calls the latest registration first
             refuse_unmarked(listener)
@@ -180,25 +180,25 @@ class Plugins:
 
 
 def load_plugins(builtins: Iterable[tuple[str, object]], points: Iterable[EntryPoint] | None = None) -> Plugins:
-    """Register the built-ins, then every entry point that loads. `points` replaces discovery in tests."""
+    """Registers the built-ins, then all entry points that load; `points` replaces discovery in tests."""
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(Hooks)
     plugins = Plugins(manager, Registry(), [], {})
     for name, plugin in builtins:
-        admit(plugins, name, plugin)
+        register_plugin(plugins, name, plugin)
     if points is None:
         points = [] if os.environ.get(BLOCK) else entry_points(group=GROUP)
     for point in points:
         try:
-            admit(plugins, point.name, point.load())
+            register_plugin(plugins, point.name, point.load())
             plugins.versions[point.name] = point.dist.version if point.dist else "?"
-        except Exception as error:  # whatever a third party raises, the rest must go on
+        except Exception as error:  # any error of a third party; other plugins must load
             plugins.failures.append(Failure(point.name, f"{type(error).__name__}: {error}"))
     return plugins
 
 
-def admit(plugins: Plugins, name: str, plugin: object) -> None:
-    """Register one plugin and let it fill the registry; on an error it is taken out again, and the error raised."""
+def register_plugin(plugins: Plugins, name: str, plugin: object) -> None:
+    """Registers one plugin and its components; unregisters it on an error."""
     before, paths = dict(plugins.registry.components), list(plugins.config_paths)
     refuse_unmarked(plugin)
     plugins.manager.register(plugin, name=name)
@@ -210,7 +210,7 @@ def admit(plugins: Plugins, name: str, plugin: object) -> None:
         if hasattr(plugin, "gsx_config_paths"):
             added = plugin.gsx_config_paths()
             if not isinstance(added, list) or not all(isinstance(path, str) for path in added):
-                raise TypeError(f"gsx_config_paths must return a list of texts, got {added!r}")
+                raise TypeError(f"gsx_config_paths returned {added!r}; return a list of strings")
             plugins.config_paths += added
     except Exception:
         plugins.manager.unregister(plugin)
@@ -219,11 +219,8 @@ def admit(plugins: Plugins, name: str, plugin: object) -> None:
 
 
 def refuse_unmarked(plugin: object) -> None:
-    """Raise TypeError for a function named like a hook without `@hookimpl`: it would silently never run."""
+    """Raises TypeError for a function named like a hook but without `@hookimpl`, which pluggy would ignore."""
     for name in dir(plugin):
-        if (
-            name.startswith(f"{GROUP}_")
-            and callable(hook := getattr(plugin, name))
-            and not hasattr(hook, f"{GROUP}_impl")
-        ):
-            raise TypeError(f"{name} is not marked with @hookimpl")
+        hook = getattr(plugin, name) if name.startswith(f"{GROUP}_") else None
+        if callable(hook) and not hasattr(hook, f"{GROUP}_impl"):
+            raise TypeError(f"{name} is not marked with @hookimpl; add the decorator")

@@ -1,7 +1,7 @@
-"""What numbers an option may be: stated beside its type, checked before a run has a folder.
+"""Ranges of numeric options, part of their types and checked before a run creates its folder.
 
-`steps: Annotated[int, Range(1, 100)]` in a dataclass of options, or one of the names below; of lists every number is
-meant. The ends are where a value stops having a meaning or a run its memory; they belong to the range.
+Use `steps: Annotated[int, Range(1, 100)]` in a dataclass of options, or a name below. In lists, the range holds for
+every number. Ends are included.
 """
 
 from collections.abc import Iterator, Mapping
@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_args, get_type_hints
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers from `least` to `most`."""
+    """Closed interval of numbers."""
 
     least: float
     most: float
@@ -31,14 +31,14 @@ Rate = Annotated[float, Range(0, 1)]
 """Learning rates."""
 Steps = Annotated[int, Range(0, MOST_STEPS)]
 Interval = Annotated[int, Range(1, MOST_STEPS)]
-"""Steps between two of something, or until its end."""
+"""Number of steps between two events, or until an end."""
 Count = Annotated[int, Range(0, 10**9)]
 Points = Annotated[int, Range(1, 10**8)]
-"""Of a scene without any."""
+"""Number of points for a scene without any."""
 Weight = Annotated[float, Range(0, 1000)]
-"""Of a term of the loss."""
+"""Weight of a term of the loss."""
 Gradient = Annotated[float, Range(0, 10**12)]
-"""Of the loss by screen positions, NDC: thresholds of density control."""
+"""Gradient of the loss by screen positions, NDC; thresholds of density control."""
 Length = Annotated[float, Range(1e-9, 10**9)]
 """World units."""
 Seconds = Annotated[float, Range(0, 10**9)]
@@ -46,44 +46,30 @@ Gigabytes = Annotated[float, Range(0, 10**6)]
 """10^9 bytes."""
 Seed = Annotated[int, Range(0, LARGEST_SEED)]
 ZOOMS = Range(1 / 64, 64)
-"""Times a resolution."""
+"""Factors of a resolution."""
 
 
 def beyond_range(options: type, values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any, Range]]:
-    """(dotted key, value, its range) of the numbers for a dataclass of options that are outside of theirs."""
-    for name, (kinds, bounds) in stated(options).items():
+    """Yields (dotted key, value, range) of the numbers outside their range."""
+    for name, (kinds, bounds) in field_ranges(options).items():
         value, key = values.get(name), f"{prefix}{name}"
         if isinstance(value, Mapping):
             for inner in kinds:
                 yield from beyond_range(inner, value, f"{key}.")
-        for own, one in by_key(key, value).items():
+        named = {f"{key}.{inner}": one for inner, one in value.items()} if isinstance(value, Mapping) else {key: value}
+        for entry, one in named.items():
             if bounds is not None and not all(number in bounds for number in numbers_in(one)):
-                yield own, one, bounds
-
-
-def by_key(key: str, value: Any) -> dict[str, Any]:
-    """A value by its dotted key, those of a mapping by theirs."""
-    return {f"{key}.{inner}": one for inner, one in value.items()} if isinstance(value, Mapping) else {key: value}
+                yield entry, one, bounds
 
 
 def numbers_in(value: Any) -> list[float]:
-    """A number, or those of a list; none where there is no value yet."""
+    """Returns a number, or those of a list, as a list."""
     several = value if isinstance(value, list | tuple) else [value]
     return [number for number in several if isinstance(number, int | float)]
 
 
-def without_range(options: type, prefix: str = "") -> Iterator[str]:
-    """Dotted keys of the fields of a dataclass that hold numbers of which no range is stated."""
-    hints = get_type_hints(options, include_extras=True)
-    for name, (kinds, bounds) in stated(options).items():
-        for inner in kinds:
-            yield from without_range(inner, f"{prefix}{name}.")
-        if bounds is None and any(part in (int, float) for part in parts_of(hints[name])):
-            yield f"{prefix}{name}"
-
-
-def stated(options: type) -> dict[str, tuple[list[type], Range | None]]:
-    """By field of a dataclass: the dataclasses that it may hold, and the range of its numbers."""
+def field_ranges(options: type) -> dict[str, tuple[list[type], Range | None]]:
+    """Returns, by field of a dataclass, its nested dataclasses and the range of its numbers."""
     found = {}
     for name, hint in get_type_hints(options, include_extras=True).items():
         inner = list(parts_of(hint))
@@ -93,7 +79,7 @@ def stated(options: type) -> dict[str, tuple[list[type], Range | None]]:
 
 
 def parts_of(hint: Any) -> Iterator[Any]:
-    """A type, its arguments, theirs, and what is noted beside them."""
+    """Yields a type, its arguments recursively, and their annotations."""
     yield hint
     for inner in (*get_args(hint), *getattr(hint, "__metadata__", ())):
         yield from parts_of(inner)

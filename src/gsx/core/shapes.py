@@ -1,4 +1,4 @@
-"""Shape annotations: `Float[Tensor, "N 3"]`. With jaxtyping installed (development) they are checked in the tests."""
+"""Shape annotations such as `Float[Tensor, "N 3"]`; tests check them if jaxtyping is installed."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,7 @@ else:
     except ImportError:
 
         class _Shaped:
-            """Stands in for jaxtyping: `Float[Tensor, "N 3"]` is then just `Tensor`."""
+            """Substitute for jaxtyping: `Float[Tensor, "N 3"]` is `Tensor`."""
 
             def __class_getitem__(cls, item: tuple[Any, str]) -> Any:
                 return item[0]

@@ -19,7 +19,7 @@ from filelock import lock_descriptor
 
 import gsx
 from gsx.core.errors import InputError
-from gsx.core.files import at_home, own_mark
+from gsx.core.files import expand_home, process_tag
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ def cache_root() -> Path:
         InputError: there is no home folder.
     """
     name = os.environ.get("GSX_CACHE") or f"{os.environ.get('XDG_CACHE_HOME') or '~/.cache'}/gsx"
-    root = at_home(name)
+    root = expand_home(name)
     if str(root).startswith("~"):
         raise InputError(
             f"the cache would be {name}, and there is no such home folder: let GSX_CACHE name a folder that can be "
@@ -184,7 +184,7 @@ def in_use() -> Iterator[None]:
     with ExitStack() as stack:
         try:
             folder = make_folder(cache_root() / IN_USE)
-            partial = folder / f".use.{own_mark()}-{secrets.token_hex(4)}.partial"
+            partial = folder / f".use.{process_tag()}-{secrets.token_hex(4)}.partial"
             locked = partial.with_suffix(".lock")  # others look for that name alone, which it gets once it is locked
             stack.callback(remove_files, partial, locked)
             lock_descriptor(stack.enter_context(partial.open("w")).fileno(), blocking=False)

@@ -16,7 +16,7 @@ from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.files import at_home
+from gsx.core.files import expand_home
 from gsx.core.ranges import Length, Points, Range, Seed
 from gsx.core.shapes import UInt8
 from gsx.formats.origin import in_words
@@ -72,7 +72,7 @@ def load(options: BlenderOptions) -> Scene:
             `downscale` or `max_width` and `scales`.
         InputError: a file is missing or damaged, there are fewer than two training images, or a scale divides no image.
     """
-    folder = at_home(options.path)
+    folder = expand_home(options.path)
     train_file, held_out = folder / TRAIN_FILE, _test_file(folder, options.split)
     train_shots, notes = read_shots(train_file, options.missing)
     test_shots, test_notes = read_shots(held_out, options.missing) if held_out else ([], [])

@@ -24,7 +24,7 @@ from gsx.core.data.images import image_size, refuse_other_size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.files import at_home
+from gsx.core.files import expand_home
 from gsx.core.ranges import Points, Seed
 from gsx.core.shapes import Float
 from gsx.scenes import colmap
@@ -68,7 +68,7 @@ def load(options: BungeeOptions) -> Scene:
         ConfigError: the split rule cannot be read.
         InputError: a file is missing or damaged, or there are fewer than two training images.
     """
-    folder = at_home(options.path)
+    folder = expand_home(options.path)
     if model_folders(folder):
         scene = colmap.load(replace(options, split="none"))
         centre = scene.points.positions.median(dim=0).values

@@ -17,7 +17,7 @@ from gsx.core.data.images import image_size, is_reduction
 from gsx.core.data.scene import Scene, View
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
-from gsx.core.files import at_home, is_file
+from gsx.core.files import expand_home, is_file
 from gsx.core.ranges import Range
 from gsx.core.shapes import Float
 from gsx.scenes.adjust import WHEN, adjusted, fit_line
@@ -68,7 +68,7 @@ def load(options: ColmapOptions) -> Scene:
     Raises:
         InputError: no model or photos, a file is corrupt, sizes disagree, or the poses do not fit the observations.
     """
-    path = at_home(options.path)
+    path = expand_home(options.path)
     folder, notes = find_model(path, options.model)
     stated = read_model(folder)
     images = images_elsewhere(path, stated, options.images)
@@ -87,7 +87,7 @@ def build(
     Raises:
         InputError: as `load`.
     """
-    path = at_home(options.path)
+    path = expand_home(options.path)
     present = present_images(model, photos, options.missing)
     turns_of = turns_of or RULES[options.orientation]
     shots = [

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gsx.core.files import own_mark
+from gsx.core.files import process_tag
 from gsx.engine.cache import enlist, listed, make_folder, whole
 
 
@@ -19,7 +19,7 @@ def kept_model(final: Path, make: Callable[[Path], Any]) -> Path:
     if intact(final):
         return final
     make_folder(final.parent)
-    with tempfile.TemporaryDirectory(".partial", f".{final.name}.{own_mark()}-", final.parent) as work:
+    with tempfile.TemporaryDirectory(".partial", f".{final.name}.{process_tag()}-", final.parent) as work:
         made = make(Path(work))
         model = make_folder(Path(work) / "model")
         made.write_binary(model)

@@ -11,7 +11,7 @@ from gsx.core.data.masks import INTERPOLATED, Mask
 from gsx.core.data.resize import Size
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError
-from gsx.core.files import at_home, is_file
+from gsx.core.files import expand_home, is_file
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.orientation import INVERSES, Turns, oriented_size
 from gsx.scenes.photo_names import SUFFIXES
@@ -82,7 +82,7 @@ def to_stored(mask: Path, turns: Turns, raster: Size) -> tuple[int, ...]:
 
 def folder_of(options: SceneOptions) -> Path:
     """Return the folder of masks: in the scene's folder, or next to it where that may be the photographs' own."""
-    path = at_home(options.path)
+    path = expand_home(options.path)
     own, beside = path / FOLDER, path.parent / FOLDER
     photographs = options.name == "photos" and not (path / IMAGES).is_dir()
     return beside if photographs and not own.is_dir() else own
@@ -113,7 +113,7 @@ def mask_notes(views: Sequence[View], options: SceneOptions) -> list[str]:
         raise InputError(
             "scene.masks=alpha, but no photograph has alpha: leave it out, or give files in a folder 'masks'"
         )
-    own = folder.parent == at_home(options.path)
+    own = folder.parent == expand_home(options.path)
     if options.masks == "auto" and own and folder.is_dir() and any(map(is_file, folder.rglob("*.*"))):
         raise InputError(
             f"None of the masks in '{folder}' has the name of a photograph: call that of a.jpg a.jpg.png or a.png, or "

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from gsx.core.data.scene import Scene
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
-from gsx.core.files import at_home
+from gsx.core.files import expand_home
 from gsx.core.quality.sharpness import sharpness_line
 from gsx.core.ranges import Range
 from gsx.engine.cache import cache_folder, content_key, file_stamp
@@ -66,7 +66,7 @@ def load(options: PhotosOptions) -> Scene:
             cannot be reconstructed.
     """
     refuse_unknown(options)
-    path = at_home(options.path)
+    path = expand_home(options.path)
     folder, photos = find_photos(path)
     sizes, notes = readable_sizes(folder, photos)
     notes += passed_over(path, folder)

@@ -15,7 +15,7 @@ from gsx.core.data.reduction import Reduction
 from gsx.core.data.resize import ResizeRule, Size, training_size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.errors import InputError
-from gsx.core.files import at_home
+from gsx.core.files import expand_home
 from gsx.core.shapes import Float
 from gsx.scenes.duplicates import refuse_shared
 from gsx.scenes.masked import mask_of, masks_named
@@ -235,7 +235,7 @@ def provenance(options: SceneOptions, views: Sequence[View]) -> dict[str, Any]:
     turned = sum(isinstance(source.remap, Turned) for source in sources)
     return {
         "format": options.name,
-        "path": at_home(options.path).resolve().name,
+        "path": expand_home(options.path).resolve().name,
         "principal_point": options.principal_point,
         "downscale": options.downscale,
         "max_width": options.max_width,

@@ -16,7 +16,7 @@ import torch
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError, nearest
-from gsx.core.files import at_home, is_file
+from gsx.core.files import expand_home, is_file
 from gsx.core.ranges import Points, Seed
 from gsx.scenes.duplicates import photos_of
 from gsx.scenes.frame_files import FILE, TEST_FILES, TRAIN_FILE, FrameFile, frame_files, is_empty, needs_lens, nodes
@@ -59,7 +59,7 @@ def load(options: TransformsOptions) -> Scene:
     Raises:
         InputError: a file is missing or damaged, a camera cannot be used, or there are fewer than two training images.
     """
-    parts = frame_files(at_home(options.path))
+    parts = frame_files(expand_home(options.path))
     by_part, notes = _shots(parts, options)
     shots = [shot for part in by_part for shot in part]
     views = views_of(shots, options)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from gsx.core.data.images import read_image
-from gsx.core.files import at_home, read_json
+from gsx.core.files import expand_home, read_json
 from gsx.core.packages import require
 from gsx.core.plugins import hookimpl
 from gsx.core.ranges import Range
@@ -95,7 +95,7 @@ def events_folder(run: Run, folder: str) -> Path:
     if not folder:
         return run.folder / "tensorboard"
     place, output = run.folder.resolve(), Path(run.config["output"]).resolve()
-    return at_home(folder) / (place.relative_to(output) if place.is_relative_to(output) else place.name)
+    return expand_home(folder) / (place.relative_to(output) if place.is_relative_to(output) else place.name)
 
 
 def pictures(renders: Path, count: int) -> dict[str, Path]:

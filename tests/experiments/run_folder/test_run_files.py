@@ -12,7 +12,7 @@ from synthetic_colmap import synthesize, write_scene
 from tiny import words
 
 from gsx.cli.dispatch import main
-from gsx.core.files import own_mark
+from gsx.core.files import process_tag
 from gsx.experiments.run_folder.files import has_figures, read_run, state_of
 from gsx.experiments.run_folder.shapes import LINE, fits, is_number
 
@@ -213,9 +213,9 @@ def test_a_run_with_odd_lines_goes_on(run: Path) -> None:
 def test_what_killed_processes_left_half_written_among_the_pictures_is_removed(run: Path, verb: str) -> None:
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
-    machine = own_mark().rpartition("-")[0]
+    machine = process_tag().rpartition("-")[0]
     left = run / "renders" / f".test_000.truth.{machine}-{dead.pid}-01234567.partial.png"
-    mine = run / "renders" / f".test_000.render.{own_mark()}-01234567.partial.png"
+    mine = run / "renders" / f".test_000.render.{process_tag()}-01234567.partial.png"
     for path in (left, mine):
         path.write_bytes(b"half")
     assert main([verb, str(run)]) == 0

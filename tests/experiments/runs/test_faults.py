@@ -244,7 +244,7 @@ def test_what_a_killed_process_left_half_written_is_removed(tmp_path: Path) -> N
         others = tmp_path / ".c.elsewhere-1-01234567.partial"
         dead = subprocess.Popen([sys.executable, "-c", ""])
         dead.wait()
-        of_the_dead = tmp_path / f".d.{files.own_mark().rpartition('-')[0]}-{dead.pid}-01234567.partial.png"
+        of_the_dead = tmp_path / f".d.{files.process_tag().rpartition('-')[0]}-{dead.pid}-01234567.partial.png"
         for path in (old, others, of_the_dead):
             path.write_text("half")
         os.utime(old, (time.time() - files.ABANDONED - 1,) * 2)

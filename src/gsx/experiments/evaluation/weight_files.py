@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.errors import InputError
-from gsx.core.files import LFS_POINTER, at_home
+from gsx.core.files import LFS_POINTER, expand_home
 
 SAVED = (b"PK\x03\x04", b"\x80")
 """First bytes of what `torch.save` writes: a ZIP archive, or a pickle as before torch 1.6."""
@@ -22,7 +22,7 @@ def read_weights(path: str, option: str) -> tuple[dict[str, Tensor], str]:
         InputError: the file is missing or holds no state dict; the message begins with `option`.
     """
     try:
-        data = at_home(path).read_bytes()
+        data = expand_home(path).read_bytes()
         weights = state_dict(data)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error

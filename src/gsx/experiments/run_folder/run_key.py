@@ -5,7 +5,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from gsx.core.files import at_home
+from gsx.core.files import expand_home
 from gsx.core.options import fields_with, flattened
 from gsx.engine.cache import content_key, file_stamp
 from gsx.experiments.run_folder.files import RunFiles, part
@@ -83,7 +83,7 @@ def folder_stamp(config: dict[str, Any]) -> str:
     scene = part(config, "scene")
     if not scene.get("path"):
         return ""
-    path = at_home(str(scene["path"]))
+    path = expand_home(str(scene["path"]))
     if not path.exists():
         return f"absent: {path}"
     folder = path if path.is_dir() else path.parent

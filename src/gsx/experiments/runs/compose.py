@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsx.core.errors import ConfigError, first_line, nearest
-from gsx.core.files import at_home
+from gsx.core.files import expand_home
 from gsx.core.plugins import Plugins
 from gsx.experiments.runs.overrides import parse_overrides, refuse_absent_launcher, refuse_sweep, with_quoted_paths
 from gsx.experiments.runs.settings import Settings, settings_from
@@ -135,7 +135,7 @@ def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
     for key in ("output", "folder"):  # which Hydra and the shell take as they are
         path = getattr(settings.general, key)
         if path == "~" or path.startswith("~/"):
-            raise ConfigError(f"{key} is '{path}', which would be below this folder: give {key}={at_home(path)}")
+            raise ConfigError(f"{key} is '{path}', which would be below this folder: give {key}={expand_home(path)}")
     return settings
 
 

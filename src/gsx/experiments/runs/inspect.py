@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from gsx.core.data.scene import Scene
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import GsxError, InputError, command
-from gsx.core.files import at_home
+from gsx.core.files import expand_home
 from gsx.core.plugins import Component, Plugins
 from gsx.experiments.run_folder.files import BEGUN
 from gsx.experiments.runs.capture import capture_lines
@@ -57,7 +57,7 @@ def describe(path: str | Path, plugins: Plugins, patient: bool = False) -> list[
 
     patient: loads what takes minutes, too. Never raises.
     """
-    path, findings = at_home(path), Findings()
+    path, findings = expand_home(path), Findings()
     loaders: Readable = []
 
     def formats() -> Iterator[str]:

@@ -10,7 +10,7 @@ import torch
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.files import at_home, file_count
+from gsx.core.files import expand_home, file_count
 from gsx.core.seeds import derived_seed
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.remarks import NOT_MEASURED
@@ -107,7 +107,7 @@ def count_notes(settings: Settings) -> list[str]:
     if not (published and path):
         return []
     images = getattr(settings.scene.options, "images", "") or "images"
-    count, compared = file_count(at_home(path) / images), "figures cannot be compared with published ones"
+    count, compared = file_count(expand_home(path) / images), "figures cannot be compared with published ones"
     return [] if count == published else [f"{images}/ holds {count} files, published are {published}: {compared}."]
 
 

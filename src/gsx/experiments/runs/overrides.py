@@ -8,7 +8,7 @@ from shutil import which
 from typing import Any, NoReturn
 
 from gsx.core.errors import ConfigError, first_line
-from gsx.core.files import at_home
+from gsx.core.files import expand_home
 
 LAUNCHERS = {
     "processes": ("hydra-joblib-launcher", "sweep"),
@@ -57,7 +57,7 @@ def with_quoted_paths(overrides: Sequence[str]) -> list[str]:
     """Returns overrides in which a path that exists stands for itself, also one such as `a=b` or `a (1)`."""
     pairs = [word.partition("=") for word in overrides]
     return [
-        word_of(key, value) if SPECIAL.search(value) and os.path.exists(at_home(value)) else f"{key}{equals}{value}"
+        word_of(key, value) if SPECIAL.search(value) and os.path.exists(expand_home(value)) else f"{key}{equals}{value}"
         for key, equals, value in pairs
     ]
 

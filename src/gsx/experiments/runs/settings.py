@@ -10,7 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsx.augmenters.checks import Checks, WithChecks
 from gsx.core.errors import ConfigError, first_line, nearest
-from gsx.core.files import at_home
+from gsx.core.files import expand_home
 from gsx.core.options import fields_with
 from gsx.core.plugins import Component, Plugins
 from gsx.core.ranges import Range, Share
@@ -159,8 +159,8 @@ def plain_values(config: DictConfig) -> dict[str, Any]:
         if "${" in text:  # an escaped one; it would be looked up when the run's configuration is read
             raise ConfigError(f"{key} is '{text}'; a run's configuration holds no ${{...}}: name it otherwise")
     if isinstance(raw.get("scene"), dict) and raw["scene"].get("path"):
-        raw["scene"]["path"] = str(at_home(str(raw["scene"]["path"])).resolve())
-    if (named := splat_file(raw.get("init"))) is not None and suffix_of(file := splat_file_at(at_home(named))):
+        raw["scene"]["path"] = str(expand_home(str(raw["scene"]["path"])).resolve())
+    if (named := splat_file(raw.get("init"))) is not None and suffix_of(file := splat_file_at(expand_home(named))):
         raw["init"] = str(file.resolve())
     return raw
 

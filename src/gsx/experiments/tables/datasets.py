@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from gsx.core.files import at_home, file_count
+from gsx.core.files import expand_home, file_count
 
 
 def missing(dataset: dict[str, Any], scene: str, root: Path) -> str:
     """Returns why a scene cannot be trained; empty if its files are complete."""
-    folder = at_home(root) / dataset["folder"] / scene if dataset["folder"] else None  # else it is built in
+    folder = expand_home(root) / dataset["folder"] / scene if dataset["folder"] else None  # else it is built in
     if folder is None:
         return ""
     if not folder.is_dir():

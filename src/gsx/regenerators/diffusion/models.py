@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from gsx.core.errors import InputError, TrainingError, first_line
-from gsx.core.files import at_home
+from gsx.core.files import expand_home
 from gsx.engine.cache import content_key, source_digest
 from gsx.regenerators.diffusion.model_specs import ModelSpec
 from gsx.regenerators.diffusion.options import DiffusionOptions
@@ -30,7 +30,7 @@ def located(options: DiffusionOptions, spec: ModelSpec) -> Path:
     Raises:
         InputError: it is not on this machine, is another model, or damaged. The message says what to do.
     """
-    folder = at_home(options.model)
+    folder = expand_home(options.model)
     if not folder.is_dir():
         folder = snapshot(options, spec)
     inspect(folder, options, spec)
