@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from gsx.augmenters.consistency import consistent_pixels, exactly_consistent
-from gsx.core.data.reduction import ENOUGH, Reduction, projected
+from gsx.core.data.reduction import TOLERANCE, Reduction, projected
 from gsx.core.data.resize import display_from_linear, resize, to_uint8
 from gsx.core.quality.metrics import psnr
 
@@ -73,7 +73,7 @@ def test_the_projection_is_the_nearest_picture_that_reduces_to_the_given_one(nam
     missing = low.flatten() - dense @ fine.flatten()
     nearest = fine.flatten() + dense.T @ torch.linalg.solve(dense @ dense.T, missing)
     torch.testing.assert_close(found.flatten(), nearest, rtol=0, atol=2e-4)
-    torch.testing.assert_close(reduction.reduce(found, factor), low, rtol=0, atol=ENOUGH)
+    torch.testing.assert_close(reduction.reduce(found, factor), low, rtol=0, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("light", ["display", "linear"])

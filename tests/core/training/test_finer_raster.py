@@ -118,9 +118,9 @@ def test_light_is_averaged_as_light_and_what_is_too_bright_is_pulled_back() -> N
     """A white and a black pixel make half of the light; losses have a gradient beyond [0, 1], photographs a clamp."""
     linear = Reduction(light="linear")
     pair = torch.tensor([[[1.0, 0.0], [1.0, 0.0]]]).repeat(3, 1, 1)
-    assert float(linear.formed(pair, 2)[0]) == pytest.approx(1.055 * 0.5 ** (1 / 2.4) - 0.055, abs=1e-6)
+    assert float(linear.unclamped(pair, 2)[0]) == pytest.approx(1.055 * 0.5 ** (1 / 2.4) - 0.055, abs=1e-6)
     bright = torch.full((3, 2, 2), 1.2, requires_grad=True)
-    low = linear.formed(bright, 2)
+    low = linear.unclamped(bright, 2)
     assert float(low.detach().max()) == pytest.approx(1.2, abs=1e-5)
     low.sum().backward()
     assert float(bright.grad.min()) > 0.2

@@ -1,7 +1,7 @@
-"""Pinhole cameras and their exact algebra.
+"""Pinhole cameras.
 
 Conventions (docs/reference/conventions.md): x right, y down, z forward (OpenCV); pixel centres at +0.5, so the raster
-covers [0, width] x [0, height]; `cx`, `cy` are honoured everywhere and may lie outside the raster (crops).
+covers [0, width] x [0, height]; the principal point (cx, cy) may lie outside the raster, as in crops.
 """
 
 import math
@@ -20,35 +20,33 @@ NEAR = 0.2  # 3D-GS rasterizer: splats at camera depth <= 0.2 scene units are cu
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """The raster a crop was cut from, in px, relative to which tiles are laid and slopes are clamped.
-
-    It makes the render of a crop the crop of the render, bit for bit.
-    """
+    """Raster that a crop was cut from, px; tiles and clamped slopes refer to it, so a crop renders the same bits."""
 
     left: int
-    """Column of the frame at which the raster begins; may be negative."""
+    """First column of the crop on the frame; may be negative."""
     top: int
+    """First row; may be negative."""
     width: int
     height: int
 
     def shares(self, across: float, down: float) -> tuple[float, float]:
-        """Return a movement in px as shares of the sides."""
+        """Returns a shift in px as shares of width and height."""
         return across / self.width, down / self.height
 
     def scaled(self, sx: float, sy: float) -> "Frame":
-        """Return the frame on a raster with so many times as many columns and rows."""
+        """Returns the frame with columns and rows scaled and rounded."""
         left, top, width, height = self.left * sx, self.top * sy, self.width * sx, self.height * sy
         return Frame(left=round(left), top=round(top), width=round(width), height=round(height))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Camera:
-    """A pinhole camera: x_camera = rotation @ x_world + translation, pixel = (fx x/z + cx, fy y/z + cy)."""
+    """Pinhole camera: x_camera = rotation @ x_world + translation, pixel = (fx x/z + cx, fy y/z + cy)."""
 
     rotation: Float[Tensor, "3 3"]
-    """Rotation camera_from_world."""
+    """Rotation, camera from world."""
     translation: Float[Tensor, "3"]
-    """Translation camera_from_world, in scene units."""
+    """Translation, camera from world, scene units."""
     fx: float
     fy: float
     cx: float
@@ -56,52 +54,52 @@ class Camera:
     width: int
     height: int
     near: float = NEAR
-    """Splats at this camera depth or nearer are not drawn, in scene units."""
+    """Largest depth at which splats are not drawn, scene units."""
     cut_from: Frame | None = None
-    """The frame this raster was cropped from; None: it is not cropped."""
+    """Frame of a crop; None: no crop."""
 
     @property
     def frame(self) -> Frame:
-        """The frame the raster lies in."""
+        """Frame of the raster, or the raster itself."""
         return self.cut_from or Frame(left=0, top=0, width=self.width, height=self.height)
 
     @property
     def centre(self) -> Float[Tensor, "3"]:
-        """Camera centre in world coordinates, -R^T t."""
+        """Camera centre, -R^T t, world coordinates."""
         return -self.rotation.T @ self.translation
 
     def to_camera(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-        """Return world points in the camera's frame, float64: far from the origin float32 is too coarse."""
+        """Transforms world points to camera coordinates, in float64: far from the origin float32 is too coarse."""
         points, double = points.double(), torch.float64
         rotation, translation = (uploaded(x, points.device, double) for x in (self.rotation.T, self.translation))
         return points @ rotation + translation
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) in pixels."""
+        """(width, height), px."""
         return self.width, self.height
 
     @property
     def focal(self) -> float:
-        """The larger focal length, px."""
+        """Larger focal length, px."""
         return max(self.fx, self.fy)
 
     def with_pose_of(self, other: "Camera") -> "Camera":
-        """Return this camera with the pose of another."""
+        """Returns this camera with the pose of another."""
         return replace(self, rotation=other.rotation, translation=other.translation)
 
     def has_pose_of(self, other: "Camera") -> bool:
-        """Return whether both have one pose, bit for bit."""
+        """Returns whether both poses have the same bits."""
         return torch.equal(self.rotation, other.rotation) and torch.equal(self.translation, other.translation)
 
     def draws_as(self, other: "Camera") -> bool:
-        """Return whether both draw the same picture, bit for bit."""
+        """Returns whether both draw pictures of the same bits."""
         numbers = ("fx", "fy", "cx", "cy", "width", "height", "near", "frame")
         alike = all(getattr(self, name) == getattr(other, name) for name in numbers)
         return alike and self.has_pose_of(other)
 
     def resize(self, width: int, height: int) -> "Camera":
-        """Return the same field of view on another raster; intrinsics scale per axis."""
+        """Returns the same field of view on another raster; intrinsics scale per axis."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self,
@@ -115,13 +113,16 @@ class Camera:
         )
 
     def zoom(self, factor: float) -> "Camera":
-        """Return the same view sampled more finely: `factor` times the focal length and the raster."""
+        """Returns the camera with `factor` times the focal length and raster, rounded to whole pixels."""
         return self.resize(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
     def crop(self, left: int, top: int, width: int, height: int) -> "Camera":
-        """Return the camera of a window with its upper left corner at pixel (left, top); InputError: it has no pixels.
+        """Returns the camera of a window with its upper left corner at pixel (left, top).
 
-        Past the raster, `cull=published` draws nothing, as 3D-GS, and `cull=tight` all.
+        Outside the raster, `cull=published` draws nothing, as 3D-GS, and `cull=tight` everything.
+
+        Raises:
+            InputError: the window has no pixels.
         """
         if width < 1 or height < 1:
             raise InputError(f"a window of {width} x {height} px has no pixels: give a width and a height of 1 or more")
@@ -129,28 +130,28 @@ class Camera:
         return replace(self, cx=self.cx - left, cy=self.cy - top, width=width, height=height, cut_from=frame)
 
     def sees(self, points: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
-        """Return which world points lie in front of it and within its raster, hidden or not."""
+        """Marks world points with depth > 0 that project onto the raster, occluded or not."""
         pixels, depth = self.project(points)
         return ((pixels >= 0) & (pixels <= pixels.new_tensor(self.size))).all(dim=1) & (depth > 0)
 
     def shows(self, pixels: Float[Tensor, "P 2"], depths: Float[Tensor, "P"]) -> Bool[Tensor, "P"]:
-        """Return which projected points lie on a pixel of its raster, beyond its near plane."""
+        """Marks projected points on a pixel of the raster and beyond the near plane."""
         return ((pixels >= 0) & (pixels < pixels.new_tensor(self.size))).all(1) & (depths > self.near)
 
     def narrow(self, fraction: float) -> "Camera":
-        """Return the camera of the centre `fraction` of the raster, at unchanged focal length."""
+        """Returns the camera of the central `fraction` of the raster."""
         width, height = max(1, round(self.width * fraction)), max(1, round(self.height * fraction))
         return self.crop((self.width - width) // 2, (self.height - height) // 2, width, height)
 
     def project(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P"]]:
-        """Return pixel positions and depths of world points; positions mean nothing where depth <= 0."""
+        """Returns pixel positions (invalid at depths <= 0) and depths of world points."""
         camera_points = self.to_camera(points)
         depth = camera_points[:, 2]
         focal, centre = depth.new_tensor([self.fx, self.fy]), depth.new_tensor([self.cx, self.cy])
         return (camera_points[:, :2] / depth[:, None] * focal + centre).to(points), depth.to(points)
 
     def unproject(self, pixels: Float[Tensor, "P 2"], depths: Float[Tensor, "P"]) -> Float[Tensor, "P 3"]:
-        """Return world points at pixel positions and depths."""
+        """Returns world points at pixel positions and depths."""
         x = (pixels[:, 0] - self.cx) / self.fx * depths
         y = (pixels[:, 1] - self.cy) / self.fy * depths
         points = torch.stack([x, y, depths], 1).double()
@@ -158,7 +159,7 @@ class Camera:
 
 
 def offsets_from(points: Float[Tensor, "P 3"], centre: Float[Tensor, "3"]) -> Float[Tensor, "P 3"]:
-    """Return points - centre, subtracted in float64 and rounded to the dtype of the points; differentiable in both.
+    """Returns points - centre, subtracted in float64, in the dtype of the points; differentiable in both.
 
     Rounding the centre first would move it by a float32 step of the coordinates (docs/explanation/numerics.md).
     """
@@ -175,7 +176,7 @@ def look_at(
     height: int,
     near: float = NEAR,
 ) -> Camera:
-    """Return a camera at `eye` looking at `target`, `up` pointing up in the picture; field of view in radians.
+    """Returns a camera at `eye` towards `target`, `up` pointing up in the picture; `fov_x` in radians.
 
     Raises:
         ValueError: `eye` equals `target`, or `up` is parallel to the viewing direction.
@@ -199,7 +200,7 @@ def pinhole(
     height: int,
     near: float = NEAR,
 ) -> Camera:
-    """Return a camera of square pixels with its principal point at the middle of the raster; focal length in px."""
+    """Returns a camera with square pixels and a central principal point; `focal` in px."""
     return Camera(
         rotation=rotation,
         translation=translation,

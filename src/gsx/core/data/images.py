@@ -1,6 +1,6 @@
-"""Images in and out through OpenImageIO, and those kept in memory.
+"""Image files, read and written by OpenImageIO, and a cache of images.
 
-Images are uint8 display values [C, H, W], red first, alpha (if any) straight and last.
+Images are uint8 display values [C, H, W], red first, straight alpha (if any) last.
 """
 
 import errno
@@ -23,34 +23,35 @@ from gsx.core.shapes import Float, Shaped, UInt8
 
 JPEG_QUALITY = 95
 PNG_EFFORT = {"png:compressionLevel": 1, "png:filter": 0x80}
-"""Little of zlib, rows by Paeth's predictor alone: less time than what libpng chooses by itself, and more bytes."""
+"""Weak compression and Paeth's predictor: faster than libpng's defaults, with more bytes."""
 
 
 def read_image(path: str | Path) -> UInt8[Tensor, "C H W"]:
-    """Decode an image to 3 or, with alpha, 4 channels.
+    """Reads an image with 3 or, with alpha, 4 channels.
 
-    Grey becomes RGB, 16 bits are rounded to 8, floating-point files are taken as scene-linear light and get the
-    sRGB curve, premultiplied colours are divided by their alpha. The raster is as stored, which is what COLMAP,
-    nerfstudio and 3D-GS state their cameras for: EXIF's orientation is not applied (gsx.scenes.orientation).
+    Grey becomes RGB, 16 bits are rounded to 8, floating-point values are linear light and get the sRGB curve,
+    premultiplied colours are divided by alpha. EXIF's orientation is not applied, as in the cameras of COLMAP,
+    nerfstudio and 3D-GS (gsx.scenes.orientation).
 
     Raises:
-        InputError: the file is missing, damaged, CMYK, or has channels that are not grey or RGB with or without alpha.
+        InputError: the file is missing, damaged, CMYK, or has channels other than grey or RGB and alpha.
     """
     pixels, spec = _decode(Path(path))
     stated = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 1 or Path(path).suffix.lower() == ".bmp"
     straight = spec.alpha_channel < 0 or stated  # OpenImageIO does not state it for BMP
-    image = _display_bytes(_rgb_or_rgba(pixels), straight, path)
-    return image.permute(2, 0, 1).contiguous()
+    if pixels.shape[2] < 3:  # grey, perhaps with alpha
+        pixels = pixels[..., (0, 0, 0, 1)[: pixels.shape[2] + 2]]
+    return _display_bytes(pixels, straight, path).permute(2, 0, 1).contiguous()
 
 
 def image_size(path: str | Path) -> Size:
-    """Return (width, height) as `read_image` gives it, from the header alone; InputError as `header_of`."""
+    """Returns (width, height) from the header alone; InputError as `header_of`."""
     spec = header_of(path)
     return spec.width, spec.height
 
 
 def has_alpha(path: str | Path) -> bool:
-    """Return whether an image has an alpha channel, from the header alone; InputError as `header_of`."""
+    """Returns whether an image has alpha, from the header alone; InputError as `header_of`."""
     return bool(header_of(path).alpha_channel >= 0)
 
 
@@ -59,12 +60,15 @@ def write_image(
     image: UInt8[Tensor, "C H W"] | Float[Tensor, "C H W"],
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write RGB as PNG or JPEG, by suffix, or straight RGBA as PNG; the file appears whole or not at all.
+    """Writes RGB as PNG or JPEG, by suffix, or straight RGBA as PNG, atomically.
 
-    image: floats are rounded by `to_uint8`; attributes: more of the header by OpenImageIO's names, EXIF for example.
+    Args:
+        path: File.
+        image: 8-bit values, or floats in [0, 1], which are rounded by `to_uint8`.
+        attributes: Further header entries by OpenImageIO's names, such as EXIF.
 
     Raises:
-        InputError: the suffix does not suit, or the file cannot be written.
+        InputError: the suffix is wrong, or the file cannot be written.
     """
     import OpenImageIO as oiio
 
@@ -92,10 +96,9 @@ def write_image(
 
 @contextmanager
 def in_memory(place: Path) -> Iterator[str]:
-    """Yield the name of a file in memory, for libraries that write by name; at the end its content goes to `place`.
+    """Yields the name of a file in memory, and copies its content to `place` at the end; other than on Linux, `place`.
 
-    OpenImageIO takes no notice of a disk that fails under a PNG or GIF, and under a JPEG it ends the process. Only
-    Linux has such files; elsewhere the name is that of `place`.
+    OpenImageIO ignores errors of the disk under a PNG or GIF, and ends the process under a JPEG.
     """
     if not hasattr(os, "memfd_create") or not os.path.isdir("/proc/self/fd"):
         yield str(place)
@@ -107,7 +110,7 @@ def in_memory(place: Path) -> Iterator[str]:
 
 
 class ImageCache:
-    """Keeps the most recently used images that fit into `budget_bytes`."""
+    """Cache of the most recently used images, of at most `budget_bytes`."""
 
     def __init__(self, budget_bytes: int) -> None:
         self._budget = budget_bytes
@@ -115,7 +118,7 @@ class ImageCache:
         self._images: OrderedDict[Hashable, Tensor] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], Shaped[Tensor, "C H W"]]) -> Shaped[Tensor, "C H W"]:
-        """Return the image stored under `key`, or else what `make` returns, which is then stored."""
+        """Returns the image of a key; calls `make` if it is not stored."""
         if key in self._images:
             self._images.move_to_end(key)
             return self._images[key]
@@ -129,7 +132,7 @@ class ImageCache:
 
 
 def composite(image: UInt8[Tensor, "4 H W"], background: tuple[float, float, float]) -> UInt8[Tensor, "3 H W"]:
-    """Composite straight-alpha RGBA over a background, in double precision, truncated to 8 bits (3D-GS)."""
+    """Composites straight-alpha RGBA over a background, in float64, truncated to 8 bits (3D-GS)."""
     values = image.double() / 255
     colour, alpha = values[:3], values[3:]
     behind = torch.tensor(background, dtype=torch.float64)[:, None, None]
@@ -137,11 +140,7 @@ def composite(image: UInt8[Tensor, "4 H W"], background: tuple[float, float, flo
 
 
 def header_of(path: str | Path) -> Any:
-    """Return OpenImageIO's description of a file, from its header alone.
-
-    Raises:
-        InputError: the file is missing or is no image.
-    """
+    """Returns OpenImageIO's description of a file, from its header; InputError: it is missing or no image."""
     reader = open_image(Path(path))
     spec = reader.spec()
     reader.close()
@@ -149,7 +148,7 @@ def header_of(path: str | Path) -> Any:
 
 
 def open_image(path: Path) -> Any:
-    """Return an OpenImageIO reader that leaves straight alpha alone."""
+    """Returns an OpenImageIO reader that does not premultiply straight alpha."""
     import OpenImageIO as oiio
 
     if not path.is_file():
@@ -165,7 +164,7 @@ def open_image(path: Path) -> Any:
 
 
 def _decode(path: Path) -> tuple[np.ndarray, Any]:
-    """Return pixels [H, W, C] in the file's own number type, and OpenImageIO's description of the file."""
+    """Returns pixels [H, W, C] in the file's number type, and its description."""
     reader = open_image(path)
     spec = reader.spec()
     refuse_unusable(path, spec)
@@ -178,14 +177,14 @@ def _decode(path: Path) -> tuple[np.ndarray, Any]:
 
 
 def damaged(path: Path, error: str) -> InputError:
-    """Return the error of a file whose pixels cannot be decoded; `error` is the library's."""
-    if "not configured" in error or "not implemented" in error:  # libtiff, of compressions it was built without
+    """Returns the error for undecodable pixels; `error` is the library's message."""
+    if "not configured" in error or "not implemented" in error:  # a libtiff without this compression
         return InputError(f"Image '{path}' cannot be decoded here ({in_one_line(error)}), save it as PNG or JPEG.")
     return InputError(f"Image '{path}' is damaged ({in_one_line(error)}), copy or export it anew.")
 
 
 def refuse_unusable(path: str | Path, spec: Any) -> None:
-    """Raise InputError for a header of inks, of a part of a picture, or of channels beyond grey or RGB and alpha."""
+    """Raises InputError for a header with CMYK, a partial picture, or channels other than grey or RGB and alpha."""
     if _is_cmyk(spec):
         raise InputError(f"Image '{path}' is CMYK, whose colours need a printing profile: convert it to sRGB.")
     if (spec.width, spec.height) != (spec.full_width, spec.full_height):
@@ -201,7 +200,7 @@ def refuse_unusable(path: str | Path, spec: Any) -> None:
 
 
 def in_one_line(text: str) -> str:
-    """Join the lines of a library's message."""
+    """Joins the lines of a message."""
     return "; ".join(line.strip() for line in text.splitlines())
 
 
@@ -210,14 +209,8 @@ def _is_cmyk(spec: Any) -> bool:
     return any(spec.get_string_attribute(name).lower() in ("cmyk", "ycbcrk", "color separated") for name in names)
 
 
-def _rgb_or_rgba(pixels: np.ndarray) -> np.ndarray:
-    """Repeat grey, with or without alpha, to three channels."""
-    channels = pixels.shape[2]
-    return pixels[..., (0, 0, 0, 1)[: channels + 2]] if channels < 3 else pixels
-
-
 def _display_bytes(pixels: np.ndarray, straight: bool, path: str | Path) -> UInt8[Tensor, "H W C"]:
-    """Return straight 8-bit display values of pixels of any number type."""
+    """Converts pixels of any number type to 8-bit display values with straight alpha."""
     if pixels.dtype == np.uint8 and straight:
         return torch.from_numpy(pixels)
     is_light = np.issubdtype(pixels.dtype, np.floating)
@@ -232,7 +225,7 @@ def _display_bytes(pixels: np.ndarray, straight: bool, path: str | Path) -> UInt
 
 
 def is_reduction(size: Size, expected: Size) -> bool:
-    """Return whether one factor of at least 1 brings both expected sides to within a pixel of the file's."""
+    """Returns whether one factor of at least 1 reduces both expected sides to the file's, within a pixel."""
     (width, height), (model_width, model_height) = size, expected
     least = max(model_width / (width + 1), model_height / (height + 1))
     most = min(model_width / max(width - 1, 1e-9), model_height / max(height - 1, 1e-9))
@@ -240,7 +233,7 @@ def is_reduction(size: Size, expected: Size) -> bool:
 
 
 def refuse_other_size(path: str | Path, size: Size, expected: Size) -> None:
-    """Raise InputError unless `is_reduction`."""
+    """Raises InputError unless `is_reduction`."""
     (width, height), (model_width, model_height) = size, expected
     if not is_reduction(size, expected):
         turned = ", which are not turned" if is_reduction((height, width), expected) else ""

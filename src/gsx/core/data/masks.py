@@ -1,6 +1,6 @@
-"""Masks of photographs, black where these show what is not part of the scene, as COLMAP and nerfstudio have them.
+"""Masks of photos, black where something is not part of the scene, as in COLMAP and nerfstudio.
 
-A pixel of a reduced picture counts where nothing it was made from is masked.
+A pixel of a reduced photo counts if no pixel it was made from is masked.
 """
 
 from collections.abc import Callable
@@ -16,27 +16,28 @@ from gsx.core.data.resize import REACH
 from gsx.core.shapes import Bool, Float, UInt8
 
 WHITE = 128
-"""Values of a mask from here on count: lossy formats leave no exact white."""
+"""Least mask value that counts; lossy formats have no exact white."""
 OPAQUE = 255
-"""Alpha that counts: less shows what is behind."""
+"""Alpha that counts; lower values show the background."""
 INTERPOLATED = 2
-"""Pixels that undistortion takes from on each side (Keys' cubic)."""
+"""Reach of undistortion's interpolation, px (Keys' cubic)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Mask:
-    """The mask of one photograph."""
+    """Mask of one photo."""
 
     path: Path
-    """A picture, black where the photograph does not count; or the photograph itself, whose alpha is meant."""
+    """Mask image, black where the photo does not count, or the photo itself."""
     alpha: bool = False
+    """True: `path` is the photo, and its alpha is the mask."""
     remap: Callable[[UInt8[Tensor, "C H W"]], UInt8[Tensor, "C h w"]] | None = None
-    """What is done to the photograph, undistortion for example."""
+    """Transformation of the photo, such as undistortion."""
     reach: int = INTERPOLATED
-    """Pixels that `remap` takes from on each side; 0 where it only turns pictures."""
+    """Reach of the interpolation in `remap`, px; 0 for rotations by 90 degrees."""
 
     def masked(self) -> Bool[Tensor, "1 H W"]:
-        """Return which pixels of the undistorted mask do not count, with all that interpolation took from them."""
+        """Marks masked pixels of the transformed photo, with all that were interpolated from them."""
         picture = read_image(self.path)
         if self.alpha:
             picture = picture if self.remap is None else self.remap(picture)
@@ -47,30 +48,30 @@ class Mask:
         return out if self.remap is None else grown(out, self.reach)
 
     def reduced(self, width: int, height: int, filter: str, whole: tuple[int, int]) -> Bool[Tensor, "1 height width"]:
-        """Return which pixels count of a photograph of the size `whole`, resized by a filter (`resize.FILTERS`)."""
+        """Marks pixels that count in a photo of size `whole`, resized by a filter (`resize.FILTERS`)."""
         return untouched(self.masked(), width, height, filter, whole)
 
 
 def untouched(
     marked: Bool[Tensor, "1 H W"], width: int, height: int, filter: str, whole: tuple[int, int]
 ) -> Bool[Tensor, "1 height width"]:
-    """Return which pixels of a picture of the size `whole`, resized by a filter, are made from no marked one."""
+    """Marks pixels of a picture of size `whole`, resized by a filter, that no marked pixel contributes to."""
     touched = adaptive_max_pool2d(marked.float()[None], (height, width))[0] > 0
     return ~grown(touched, REACH.get(filter, 0) if (width, height) != whole else 0)
 
 
 def grown(masked: Bool[Tensor, "1 H W"], reach: int) -> Bool[Tensor, "1 H W"]:
-    """Grow a mask by all pixels within `reach` of it."""
+    """Extends a mask by `reach` px."""
     return max_pool2d(masked.float()[None], 2 * reach + 1, 1, reach)[0] > 0
 
 
 def where_counted(
     image: Float[Tensor, "C H W"], other: Float[Tensor, "C H W"], counted: Bool[Tensor, "H W"] | None
 ) -> Float[Tensor, "C H W"]:
-    """Return the image where pixels count, the other elsewhere; the image itself where there is no mask."""
+    """Returns the image where pixels count and the other elsewhere; None: the image."""
     return image if counted is None else torch.where(counted.to(image.device), image, other)
 
 
 def blacked(image: Float[Tensor, "C H W"], counted: Bool[Tensor, "H W"] | None) -> Float[Tensor, "C H W"]:
-    """Blacken an image where pixels do not count, so that pictures can be compared whatever is there."""
+    """Returns the image with masked pixels black."""
     return image if counted is None else torch.where(counted.to(image.device), image, 0)

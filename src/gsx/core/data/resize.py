@@ -1,4 +1,4 @@
-"""Pictures made smaller or larger: kernels, the light they are averaged in, sizes in training."""
+"""Resizing of pictures: kernels, linear light, training sizes."""
 
 import math
 from dataclasses import dataclass
@@ -10,26 +10,26 @@ from gsx.core.errors import ConfigError, nearest
 from gsx.core.shapes import Float, UInt8
 
 Size = tuple[int, int]
-"""(width, height) in pixels."""
+"""(width, height), px."""
 FILTERS = ("bicubic", "area", "lanczos")
 LIGHTS = ("display", "linear")
 
 
 def linear_from_display(display: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Return the light of display values (IEC 61966-2-1, sRGB), below 0 by the straight part of the curve."""
-    bright = display.clamp_min(0.04045)  # a power of what is negative is nan, and so is its gradient
+    """Returns linear light of display values (IEC 61966-2-1, sRGB); the linear part of the curve extends below 0."""
+    bright = display.clamp_min(0.04045)  # powers of negative numbers are nan, and so are their gradients
     return torch.where(display <= 0.04045, display / 12.92, ((bright + 0.055) / 1.055) ** 2.4)
 
 
 def display_from_linear(light: Float[Tensor, "*shape"], limited: bool = True) -> Float[Tensor, "*shape"]:
-    """Return display values of light, clamped to [0, 1] unless not `limited` (IEC 61966-2-1, sRGB)."""
+    """Returns display values of linear light (IEC 61966-2-1, sRGB), clamped to [0, 1] if `limited`."""
     light = light.clamp(0, 1) if limited else light
     bright = light.clamp_min(0.0031308)  # a power's slope at 0 is infinite
     return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * bright ** (1 / 2.4) - 0.055)
 
 
 def training_size(width: int, height: int, downscale: int, max_width: int) -> Size:
-    """Return the size to train at (3D-GS): divided by `downscale` and rounded; else at most `max_width` (0: any)."""
+    """Returns the training size (3D-GS): divided by `downscale` and rounded, or at most `max_width` wide (0: any)."""
     if downscale > 1:
         return max(1, round(width / downscale)), max(1, round(height / downscale))
     if max_width and width > max_width:
@@ -41,10 +41,10 @@ def training_size(width: int, height: int, downscale: int, max_width: int) -> Si
 def resize(
     image: UInt8[Tensor, "C H W"], width: int, height: int, filter: str = "bicubic", light: str = "display"
 ) -> UInt8[Tensor, "C height width"]:
-    """Resize an image, each channel on its own: composite alpha first.
+    """Resizes an image, each channel on its own; composite alpha first.
 
-    All filters (`FILTERS`) widen with the reduction, so nothing aliases: Keys' cubic with a = -0.5, which on display
-    values is the published filter; the coverage of pixels by pixels (area); Lanczos with 3 lobes.
+    All filters (`FILTERS`) widen with the reduction against aliasing: Keys' cubic with a = -0.5, the published filter
+    on display values; pixel coverage (area); Lanczos with 3 lobes.
     """
     if image.shape[1:] == (height, width):
         return image
@@ -60,7 +60,7 @@ def resize(
 
 @dataclass(frozen=True, kw_only=True)
 class ResizeRule:
-    """How photographs become training images."""
+    """Rule from photos to training images."""
 
     filter: str
     light: str
@@ -86,12 +86,12 @@ def _down(values: Float[Tensor, "C H W"], weights: Float[Tensor, "new H"]) -> Fl
 
 
 def _rounded(levels: Float[Tensor, "C H W"]) -> UInt8[Tensor, "C H W"]:
-    """Round values in 0..255 to 8 bits; ties, which are exact on this scale, go up."""
+    """Rounds values in 0..255 to 8 bits, ties up."""
     return (levels + 0.5).clamp(0, 255).to(torch.uint8)
 
 
 def _weights(size: int, new_size: int, filter: str) -> Float[Tensor, "new_size size"]:
-    """Return the filter as a sparse matrix whose rows add up to 1: what each new pixel takes from the old ones."""
+    """Returns the filter as a sparse matrix, new pixels by old ones, whose rows add up to 1."""
     ratio = size / new_size
     stretch = max(ratio, 1.0)
     reach = (1 + ratio) / 2 if filter == "area" else REACH[filter] * stretch
@@ -110,14 +110,14 @@ def _weights(size: int, new_size: int, filter: str) -> Float[Tensor, "new_size s
 
 
 def _keys(x: Tensor) -> Tensor:
-    """Evaluate Keys' cubic (1981) with a = -0.5, for |x| <= 2."""
+    """Evaluates Keys' cubic (1981) with a = -0.5, for |x| <= 2."""
     x = x.abs()
     inner = (1.5 * x - 2.5) * x * x + 1
     return torch.where(x < 1, inner, ((-0.5 * x + 2.5) * x - 4) * x + 2)
 
 
 def _lanczos(x: Tensor) -> Tensor:
-    """Evaluate sinc, windowed by its own central lobe, three times as wide, for |x| <= 3."""
+    """Evaluates sinc(x) sinc(x / 3), for |x| <= 3."""
     return torch.sinc(x) * torch.sinc(x / 3)
 
 
@@ -126,5 +126,5 @@ REACH = {"bicubic": 2, "lanczos": 3}
 
 
 def to_uint8(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
-    """Round display values in [0, 1] to 8 bits: x 255 + 0.5, clamped (3D-GS, metrics.py)."""
+    """Rounds display values in [0, 1] to 8 bits: x 255 + 0.5, clamped (3D-GS, metrics.py)."""
     return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)

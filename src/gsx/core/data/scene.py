@@ -1,4 +1,4 @@
-"""What every loader returns: views with truth at any resolution the data allow, points, extent, background."""
+"""Scenes as loaders return them: views with images at several resolutions, points, extent, background."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -16,104 +16,104 @@ from gsx.core.shapes import Bool, Float, UInt8
 
 @runtime_checkable
 class ImageSource(Protocol):
-    """Where the truth of one view comes from: a photograph, whose file `path` names, or an analytic scene."""
+    """Source of a view's images: a photo, with its file `path`, or an analytic scene."""
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
-        """Return the truth as `camera` sees it: the view's camera at any zoom, or a crop of that."""
+        """Returns the image for a camera: the view's camera at any zoom up to `max_zoom`, or a crop of it."""
         ...
 
     def max_zoom(self, camera: Camera) -> float:
-        """Return the largest zoom of `camera` for which there is truth (1.0: only as it is; inf: any)."""
+        """Returns the largest zoom of a camera with an image (1: none finer; inf: any)."""
         ...
 
 
 @runtime_checkable
 class Masked(Protocol):
-    """A source of which some pixels may not count."""
+    """A source with masked pixels."""
 
     def counted(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
-        """Return which pixels of `image(camera)` count; None: all."""
+        """Marks the unmasked pixels of `image(camera)`; None: all."""
         ...
 
 
 @runtime_checkable
 class CutOut(Protocol):
-    """A source of pictures that may be transparent where they show nothing of the scene."""
+    """A source with alpha, transparent where only background is visible."""
 
     def transparent(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
-        """Return which pixels of `image(camera)` show the background alone; None: unknown."""
+        """Marks the pixels of `image(camera)` that show only background; None: unknown."""
         ...
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DerivedSource:
-    """The picture, file and mask of another source; subclasses change some of them."""
+    """Image, file and mask of another source; subclasses change some of them."""
 
     source: ImageSource
 
     @property
     def path(self) -> Path | None:
-        """The file that the other source reads, if any."""
+        """File of the other source, if any."""
         return file_of(self.source)
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
-        """Return the other source's picture."""
+        """Returns the other source's image."""
         return self.source.image(camera)
 
     def max_zoom(self, camera: Camera) -> float:
-        """Return the other source's largest zoom."""
+        """Returns the other source's largest zoom."""
         return self.source.max_zoom(camera)
 
     def counted(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
-        """Return which pixels of the other source count; None: all."""
+        """Marks the other source's unmasked pixels; None: all."""
         return self.source.counted(camera) if isinstance(self.source, Masked) else None
 
 
 def file_of(source: ImageSource) -> Path | None:
-    """Return the file that a source reads, its `path`; None: it computes its pictures."""
+    """Returns the file of a source; None: its images are computed."""
     path = getattr(source, "path", None)
     return None if path is None else Path(path)
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera and the image it took. Images are decoded when asked for and kept as uint8."""
+    """Camera with its image; images are decoded on demand, as uint8."""
 
     name: str
     camera: Camera
     source: ImageSource
     group: str = ""
-    """Name of the group the view is reported under, for example a BungeeNeRF scale; empty: none."""
+    """Group in reports, such as a BungeeNeRF scale; empty: none."""
 
     @property
     def file(self) -> Path | None:
-        """The photograph's file; None: the picture is computed."""
+        """File of the photo; None: the image is computed."""
         return file_of(self.source)
 
     def image(self) -> Float[Tensor, "3 H W"]:
-        """Return the truth at the camera's resolution, display values in [0, 1]."""
+        """Returns the image at the camera's resolution, display values in [0, 1]."""
         return self.picture().float() / 255.0
 
     def picture(self) -> UInt8[Tensor, "3 H W"]:
-        """Return the truth at the camera's resolution, 8 bits; InputError: the source gives another kind of picture."""
+        """Returns the 8-bit image at the camera's resolution; InputError: its dtype or shape is another."""
         image, (width, height) = self.source.image(self.camera), self.camera.size
         if image.dtype != torch.uint8 or image.shape != (3, height, width):
             raise InputError(
-                f"the picture of view '{self.name}' is {image.dtype} {list(image.shape)}, and its camera takes "
-                f"torch.uint8 {[3, height, width]}: its source is to return that"
+                f"the picture of view '{self.name}' is {image.dtype} {list(image.shape)}, but its camera needs "
+                f"torch.uint8 {[3, height, width]}: correct its source"
             )
         return image
 
     def counted(self) -> Bool[Tensor, "H W"] | None:
-        """Return which pixels count in losses and figures, being part of the scene; None: all."""
+        """Marks the pixels that count in losses and metrics; None: all."""
         return self.source.counted(self.camera) if isinstance(self.source, Masked) else None
 
     def transparent(self) -> Bool[Tensor, "H W"] | None:
-        """Return which pixels show nothing of the scene, by the picture's alpha; None: unknown."""
+        """Marks the pixels that show only background, by the image's alpha; None: unknown."""
         return self.source.transparent(self.camera) if isinstance(self.source, CutOut) else None
 
     def zoom(self, factor: float) -> "View | None":
-        """Return the view sampled `factor` times as finely, or None where the data hold no such truth."""
+        """Returns the view at `factor` times its resolution; None: there is no such image."""
         if factor > self.source.max_zoom(self.camera):
             return None
         return replace(self, camera=self.camera.zoom(factor))
@@ -121,10 +121,10 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Points that initialise a backbone."""
+    """Initial points of a backbone."""
 
     positions: Float[Tensor, "P 3"]
-    """World coordinates, float32; of loaders, float64 where they lie far from (0, 0, 0) (`gsx.scenes.origin`)."""
+    """World coordinates, float32; from loaders float64 if far from the origin (`gsx.scenes.origin`)."""
     colours: UInt8[Tensor, "P 3"]
     """Display RGB."""
 
@@ -134,27 +134,27 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scene:
-    """A scene ready for training."""
+    """Scene for training: views, points, background."""
 
     name: str
     train: Sequence[View]
     test: Sequence[View]
     points: PointCloud
     background: Float[Tensor, "3"]
-    """Display colour behind the scene, in [0, 1]."""
+    """Display RGB behind the scene, in [0, 1]."""
     extent: float
-    """1.1 x the largest distance of a training camera from their mean (3D-GS, getNerfppNorm)."""
+    """1.1 x largest distance of a training camera from their mean, scene units (3D-GS, getNerfppNorm)."""
     reduction: Reduction = Reduction()
-    """How its pictures come from finer ones: photographs by their resize rule. The default: box averages."""
+    """Filter from finer images to the training images; the default is a box average."""
     notes: Sequence[str] = ()
-    """What a user should know of how it was loaded: skipped images, undistortion, fallbacks. Logged at start."""
+    """Remarks on loading for the log: skipped images, undistortion, fallbacks."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Subtracted from positions of cameras and points; add it for coordinates of the scene's files."""
+    """Offset subtracted from all positions; add it for coordinates of the scene's files."""
     provenance: dict[str, Any] = field(default_factory=dict)
-    """Format, folder, resize rule, split rule: goes into the evaluation protocol. JSON-serialisable."""
+    """Format, folder, resize and split rule for the evaluation protocol. JSON-serialisable."""
 
 
 def extent_of(cameras: Sequence[Camera]) -> float:
-    """Return 1.1 x the largest distance of a camera centre from the mean centre (3D-GS, getNerfppNorm)."""
+    """Returns 1.1 x the largest distance of a camera centre from their mean (3D-GS, getNerfppNorm)."""
     centres = torch.stack([camera.centre.double() for camera in cameras])
     return 1.1 * float((centres - centres.mean(0)).norm(dim=1).max())

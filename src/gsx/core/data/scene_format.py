@@ -1,4 +1,4 @@
-"""Description of a scene format, by which a loader recognises its folders."""
+"""Scene formats, by which loaders recognise their folders."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -7,17 +7,17 @@ from pathlib import Path
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFormat:
-    """What a loader knows of a folder before it loads it, for `gsx scenes PATH`."""
+    """Description of a scene format, for `gsx scenes PATH`."""
 
     meaning: str
-    """What a folder of this format is, in a few words."""
+    """Name of the format in a few words."""
     sign: str
-    """What it is known by, without an article: 'transforms.json'."""
+    """Characteristic file, without an article: 'transforms.json'."""
     recognise: Callable[[Path], bool]
-    """Whether a folder can be read as this format."""
+    """Returns whether a folder has this format."""
     facts: Callable[[Path], Iterable[str]] = lambda path: ()
-    """Lines on its content: label, blanks up to column 10, text; an error that it raises is reported as a problem."""
+    """Returns lines on the content: label, blanks up to column 10, text; errors are reported as problems."""
     overrides: Callable[[Path], Mapping[str, str]] = lambda path: {}
-    """Options of the scene that this folder needs, beside its path."""
+    """Returns scene options that a folder needs in addition to its path."""
     quick: bool = True
-    """Whether loading takes seconds, so that `gsx scenes` may load it."""
+    """True: loading takes only seconds, so `gsx scenes` may load it."""

@@ -1,4 +1,4 @@
-"""Parts of rasters."""
+"""Windows of rasters."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from gsx.core.shapes import Shaped
 
 @dataclass(frozen=True)
 class Window:
-    """A rectangle of a raster, px."""
+    """Rectangle of a raster, px."""
 
     left: int
     top: int
@@ -19,20 +19,20 @@ class Window:
     height: int
 
     def cut(self, image: Shaped[Tensor, "C H W"]) -> Shaped[Tensor, "C h w"]:
-        """Return the part of an image inside the window."""
+        """Returns the part of an image inside the window."""
         return image[:, *self.pixels]
 
     @property
     def pixels(self) -> tuple[slice, slice]:
-        """Rows and columns of the raster."""
+        """Slices of rows and columns."""
         return slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
 
     def of(self, camera: Camera) -> Camera:
-        """Return the camera through this window."""
+        """Returns the camera of the window."""
         return camera.crop(self.left, self.top, self.width, self.height)
 
     def mapped_to(self, other: Camera, camera: Camera) -> "Window":
-        """Return the pixels of another raster that show a part of this window of `camera`; maybe none."""
+        """Returns the pixels of `other` that show a part of this window of `camera`, at the same pose; maybe none."""
         left, right = (
             (edge - camera.cx) / camera.fx * other.fx + other.cx for edge in (self.left, self.left + self.width)
         )
@@ -43,18 +43,18 @@ class Window:
         return Window(columns.start, rows.start, len(columns), len(rows))
 
     def shares(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """Return left, top, right and bottom edge, as shares of a raster of that size."""
+        """Returns the left, top, right and bottom edge as shares of a raster of that size."""
         right, bottom = self.left + self.width, self.top + self.height
         return self.left / width, self.top / height, right / width, bottom / height
 
     def grown(self, margin: int, width: int, height: int) -> "Window":
-        """Return the window with up to `margin` more on each side, as far as a raster of that size reaches."""
+        """Returns the window extended by `margin` on each side, inside a raster of that size."""
         left, top = max(0, self.left - margin), max(0, self.top - margin)
         right, bottom = min(width, self.left + self.width + margin), min(height, self.top + self.height + margin)
         return Window(left, top, right - left, bottom - top)
 
     def halves(self, unit: int) -> tuple["Window", "Window"]:
-        """Return two windows, cut across the longer side at the multiple of `unit` px nearest its middle."""
+        """Splits the window across its longer side at the multiple of `unit` px nearest the middle."""
         cut = max(1, round(max(self.width, self.height) / 2 / unit)) * unit
         if self.width >= self.height:
             beyond = Window(self.left + cut, self.top, self.width - cut, self.height)
@@ -64,10 +64,10 @@ class Window:
 
 
 ROUNDING = 1e-6
-"""Px that edges of a window may lie beside whole pixels without touching the next."""
+"""Tolerance of a window's edge from a pixel boundary, px."""
 
 
 def covered(begin: float, end: float, size: int) -> range:
-    """Return those of `size` pixels in a row that lie between two places, in part or whole."""
+    """Returns the pixels, of `size` in a row, that overlap the interval."""
     first, last = math.floor(begin + ROUNDING), math.ceil(end - ROUNDING)
     return range(min(max(first, 0), size), min(max(last, 0), size))

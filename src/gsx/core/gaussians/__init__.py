@@ -1,1 +1,1 @@
-"""Gaussians: their parameters, harmonics and rotations, their neighbours."""
+"""Gaussians: parameters, spherical harmonics, rotations."""

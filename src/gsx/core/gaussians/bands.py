@@ -14,7 +14,7 @@ BAND_3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.373176332
 
 
 def bands(x: Tensor, y: Tensor, z: Tensor, degree: int) -> list[Tensor]:
-    """Y_1 .. Y_B of unit directions by their components, B = (degree + 1)^2 - 1."""
+    """Returns Y_1 .. Y_B of unit directions (x, y, z), B = (degree + 1)^2 - 1."""
     values = [-BAND_1 * y, BAND_1 * z, -BAND_1 * x]
     if degree >= 2:
         a, b, c = BAND_2
@@ -29,20 +29,20 @@ def bands(x: Tensor, y: Tensor, z: Tensor, degree: int) -> list[Tensor]:
 
 
 def harmonics_along(offsets: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "B N"]:
-    """`harmonics` of offsets of any length, a row for each band."""
+    """Returns `harmonics` of offsets of any length, a row for each band."""
     x, y, z = offsets.unbind(1)
     shrink = (x * x + y * y + z * z).clamp_min(1e-24).rsqrt()
     return torch.stack(bands(x * shrink, y * shrink, z * shrink, degree))
 
 
 def contraction(rest: Float[Tensor, "N B 3"], basis: Float[Tensor, "B N"]) -> Float[Tensor, "N 3"]:
-    """sum over b of basis[b, n] rest[n, b, c], in one loop over splats once it is compiled."""
+    """Returns sum_b basis[b, n] rest[n, b, c], one loop over splats when compiled."""
     coefficients = rest.flatten(1).unbind(1)
     return torch.stack([sum_of_products(basis.unbind(), coefficients[channel::3]) for channel in range(3)], 1)
 
 
 def sum_of_products(left: Sequence[Tensor], right: Sequence[Tensor]) -> Tensor:
-    """left[0] right[0] + left[1] right[1] + ..."""
+    """Returns left[0] right[0] + left[1] right[1] + ..."""
     total = left[0] * right[0]
     for one, other in zip(left[1:], right[1:], strict=True):
         total = total + one * other
@@ -52,7 +52,7 @@ def sum_of_products(left: Sequence[Tensor], right: Sequence[Tensor]) -> Tensor:
 def contraction_slopes(
     gradient: Float[Tensor, "N 3"], rest: Float[Tensor, "N B 3"], basis: Float[Tensor, "B N"]
 ) -> tuple[Float[Tensor, "N B 3"], Float[Tensor, "B N"]]:
-    """Gradients of `rest` and `basis` by that of their contraction."""
+    """Returns the gradients of `rest` and `basis` from that of their contraction."""
     channels, coefficients = gradient.unbind(1), rest.flatten(1).unbind(1)
     by_rest = torch.stack([band * channel for band in basis for channel in channels], 1)
     by_basis = [sum_of_products(channels, coefficients[3 * band : 3 * band + 3]) for band in range(len(basis))]

@@ -1,4 +1,4 @@
-"""Gaussians as the rasterizer draws them for one camera (3D-GS, sh_utils.py)."""
+"""Splats of standard Gaussians for one camera."""
 
 from torch import Tensor
 from torch.nn.functional import logsigmoid
@@ -10,17 +10,12 @@ from gsx.core.shapes import Float
 
 
 def splats_of(gaussians: Gaussians, camera_centre: Float[Tensor, "3"]) -> Splats:
-    """Return the splats that a camera at `camera_centre` sees, with all SH bands active."""
-    degree = degree_of(gaussians.sh_rest.shape[1])
+    """Returns the splats for a camera at `camera_centre`, with all bands of harmonics."""
+    degree, offsets = degree_of(gaussians.sh_rest.shape[1]), offsets_from(gaussians.means, camera_centre)
     return Splats(
         means=gaussians.means,
         scales=gaussians.log_scales.exp(),
         quats=gaussians.quats,
         log_opacities=logsigmoid(gaussians.opacity_logits),
-        colours=colours_of(
-            gaussians.sh_dc[:, None],
-            gaussians.sh_rest,
-            offsets_from(gaussians.means, camera_centre),
-            degree,
-        ),
+        colours=colours_of(gaussians.sh_dc[:, None], gaussians.sh_rest, offsets, degree),
     )

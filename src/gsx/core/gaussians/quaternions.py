@@ -8,12 +8,12 @@ from gsx.core.shapes import Float
 
 @torch.no_grad()
 def make_identity_where_zero(quats: Float[Tensor, "N 4"]) -> None:
-    """Turn zero quaternions into the identity that they stand for, in place: at zero they have no gradient."""
+    """Replaces zero quaternions, which have no gradient, by the identity, in place."""
     quats[:, 0] = torch.where(quats.any(1), quats[:, 0], 1.0)
 
 
 def rotation_matrices(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
-    """Rotation matrices of quaternions (w, x, y, z) of any length; a zero quaternion is the identity (3D-GS)."""
+    """Returns the rotation matrices of quaternions of any length; the zero quaternion is the identity (3D-GS)."""
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True).clamp_min(1e-12)).unbind(1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
@@ -24,8 +24,7 @@ def rotation_matrices(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
 
 
 def quaternions_of(rotations: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 4"]:
-    """Unit quaternions (w, x, y, z) of rotation matrices: of four expressions the one without cancellation (Shepperd
-    1978)."""
+    """Returns unit quaternions of rotation matrices, by the formula without cancellation (Shepperd 1978)."""
     r = rotations.permute(1, 2, 0)
     trace = r[0, 0] + r[1, 1] + r[2, 2]
     squares = torch.stack([1 + trace, *(1 - trace + 2 * r[i, i] for i in range(3))])

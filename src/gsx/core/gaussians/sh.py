@@ -1,4 +1,4 @@
-"""Real spherical harmonics of bands 0..3 with the signs of 3D-GS (3D-GS, sh_utils.py)."""
+"""Real spherical harmonics of bands 0..3, and colours from them (3D-GS, sh_utils.py)."""
 
 import functools
 
@@ -12,25 +12,25 @@ from gsx.core.shapes import Float
 
 
 def degree_of(coefficients: int) -> int:
-    """Return the degree of spherical harmonics that have `coefficients` besides the constant one."""
+    """Returns the degree of harmonics with that number of coefficients after the constant one."""
     return round((coefficients + 1) ** 0.5) - 1
 
 
 def harmonics(directions: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N B"]:
-    """Y_1 .. Y_B of unit directions, B = (degree + 1)^2 - 1: everything but the constant band. `degree` is 1..3."""
+    """Returns Y_1 .. Y_B of unit directions, without the constant band; B = (degree + 1)^2 - 1, degree 1..3."""
     x, y, z = directions.unbind(1)
     return torch.stack(bands(x, y, z, degree), 1)
 
 
 class Contraction(torch.autograd.Function):
-    """sum over b of basis[b, n] rest[n, b, c]."""
+    """Autograd function of sum_b basis[b, n] rest[n, b, c]."""
 
     @staticmethod
     def forward(ctx, basis, rest, backend):
         ctx.save_for_backward(basis, rest)
         ctx.backend = backend
         contract = backend.kernel(contraction, variant=(len(basis),)) if backend.compiled else spread_contraction
-        return contract(rest[:], basis)  # a view, or torch would compile once more where others are none
+        return contract(rest[:], basis)  # always a view: torch compiles anew for other tensors
 
     @staticmethod
     @once_differentiable
@@ -43,8 +43,7 @@ class Contraction(torch.autograd.Function):
 
 
 def spread_contraction(rest: Float[Tensor, "N B 3"], basis: Float[Tensor, "B N"]) -> Float[Tensor, "N 3"]:
-    """`contraction` in few operations: rows of B x 3 coefficients are multiplied as they lie in memory; matrices of
-    zeros and ones spread what belongs to a band or to a channel over them, and gather it."""
+    """Returns `contraction` by two products with matrices of zeros and ones, fast in eager torch."""
     by_band, by_channel = spreads(rest.shape[1], rest.dtype, rest.device)
     return (basis.T @ by_band).mul_(rest.flatten(1)) @ by_channel.T
 
@@ -52,19 +51,18 @@ def spread_contraction(rest: Float[Tensor, "N B 3"], basis: Float[Tensor, "B N"]
 def spread_slopes(
     gradient: Float[Tensor, "N 3"], rest: Float[Tensor, "N B 3"], basis: Float[Tensor, "B N"]
 ) -> tuple[Float[Tensor, "N B 3"], Float[Tensor, "B N"]]:
-    """`contraction_slopes` in the same way."""
+    """Returns `contraction_slopes` in the same way."""
     by_band, by_channel = spreads(rest.shape[1], rest.dtype, rest.device)
-    seen = gradient @ by_channel
-    by_rest = (basis.T @ by_band).mul_(seen).view(rest.shape)
-    return by_rest, by_band @ seen.mul_(rest.flatten(1)).T
+    by_coefficient = gradient @ by_channel
+    by_rest = (basis.T @ by_band).mul_(by_coefficient).view(rest.shape)
+    return by_rest, by_band @ by_coefficient.mul_(rest.flatten(1)).T
 
 
 @functools.lru_cache
 def spreads(
     count: int, dtype: torch.dtype, device: torch.device
 ) -> tuple[Float[Tensor, "B B_3"], Float[Tensor, "3 B_3"]]:
-    """Matrices that copy the value of each of so many bands, and of each channel, to the coefficients that belong to
-    it."""
+    """Returns matrices that copy values of bands, and of channels, to their coefficients."""
     bands_, channels = (torch.eye(n, dtype=dtype, device=device) for n in (count, 3))
     return bands_.repeat_interleave(3, 1), channels.repeat(1, count)
 
@@ -76,7 +74,7 @@ def colours_of(
     degree: int,
     backend: Backend = EAGER,
 ) -> Float[Tensor, "N 3"]:
-    """max(0, 0.5 + SH): colours seen along `offsets` (splat minus camera centre, any length) up to `degree`."""
+    """Returns colours max(0, 0.5 + SH) along `offsets` (splat minus camera centre, any length) up to `degree`."""
     colours = colour_of_constant(constant[:, 0])
     if degree == 0:
         return colours.clamp_min(0)
@@ -84,17 +82,17 @@ def colours_of(
     if not backend.compiled or len(offsets) < 2:
         basis = harmonics_along(offsets, degree).to(rest)
         return (colours + Contraction.apply(basis, rest[:, :count], EAGER)).clamp_min(0)
-    basis = backend.kernel(harmonics_along, degree_of(rest.shape[1]))(offsets).to(rest)  # of all bands: compiled once
+    basis = backend.kernel(harmonics_along, degree_of(rest.shape[1]))(offsets).to(rest)  # all bands: compiled once
     if count < len(basis):
         basis = torch.cat([basis[:count], torch.zeros_like(basis[count:])])
     return (colours + Contraction.apply(basis, rest, backend)).clamp_min(0)
 
 
 def constant_from_colour(colour: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """Coefficient of the constant band that shows `colour` (display RGB in [0, 1])."""
+    """Returns the constant coefficient of a colour (display RGB in [0, 1])."""
     return (colour - 0.5) / BAND_0
 
 
 def colour_of_constant(constant: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """The colour that coefficients of the constant band show by themselves."""
+    """Returns the colour of the constant coefficient alone."""
     return 0.5 + BAND_0 * constant

@@ -1,4 +1,4 @@
-"""Gaussians: as the rasterizer draws them, and as a standard file holds them."""
+"""Gaussians as input of the rasterizer, and as parameters of a standard splat file."""
 
 from dataclasses import dataclass
 
@@ -9,18 +9,18 @@ from gsx.core.shapes import Float
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Splats:
-    """Explicit Gaussians, differentiable in every field. N splats with C channels; N may be 0."""
+    """N Gaussians with C channels for the rasterizer, differentiable in every field; N may be 0."""
 
     means: Float[Tensor, "N 3"]
     """World positions."""
     scales: Float[Tensor, "N 3"]
     """Standard deviations along the principal axes, world units, >= 0."""
     quats: Float[Tensor, "N 4"]
-    """Rotations (w, x, y, z); need not be unit, a zero quaternion is the identity."""
+    """Rotations (w, x, y, z) of any length; the zero quaternion is the identity."""
     log_opacities: Float[Tensor, "N"]
-    """ln of the opacity, <= 0. From logsigmoid of the raw parameter, never the log of a rounded probability."""
+    """ln of the opacity, <= 0, from logsigmoid of the raw parameter."""
     colours: Float[Tensor, "N C"]
-    """Colour or any other channels to blend."""
+    """Colour or other channels to blend."""
 
     def __len__(self) -> int:
         return len(self.means)
@@ -28,7 +28,7 @@ class Splats:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Gaussians:
-    """Explicit Gaussians in the raw parameters of a standard splat file."""
+    """N Gaussians in the raw parameters of a standard splat file, with B harmonics besides the constant one."""
 
     means: Float[Tensor, "N 3"]
     log_scales: Float[Tensor, "N 3"]

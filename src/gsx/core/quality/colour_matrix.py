@@ -1,4 +1,4 @@
-"""Colour matrices: A [r, g, b, 1]^T of every pixel."""
+"""Affine colour transformations of images by 3x4 matrices."""
 
 import torch
 from torch import Tensor
@@ -14,8 +14,10 @@ def transform_colours(image: Float[Tensor, "3 H W"], matrix: Float[Tensor, "3 4"
 def fit_colours(
     image: Float[Tensor, "3 H W"], truth: Float[Tensor, "3 H W"], mask: Bool[Tensor, "H W"]
 ) -> Float[Tensor, "3 4"]:
-    """Returns the matrix that brings the masked pixels closest to the truth, by least squares."""
+    """Returns the matrix that best fits the image to the truth where `mask` is True, by least squares."""
     mask = mask.to(image.device)
     rows = torch.cat([image, torch.ones_like(image[:1])])[:, mask].double().T.cpu()
     target = truth[:, mask].double().T.cpu()
-    return torch.linalg.lstsq(rows, target, driver="gelsd").solution.T.float().to(image.device)  # of lower rank: least
+    return (
+        torch.linalg.lstsq(rows, target, driver="gelsd").solution.T.float().to(image.device)
+    )  # least norm

@@ -16,11 +16,11 @@ from gsx.core.quality.similarity import (
 from gsx.core.shapes import Float
 
 PADDING = WINDOW // 2
-"""With so many zeros around it the blurred picture has its size."""
+"""Zeros on each side that keep the size of a blurred picture."""
 
 
 def blur(maps: Float[Tensor, "M H W"], padding: int, backend: Backend = EAGER) -> Float[Tensor, "M h w"]:
-    """Separable Gaussian window over each map, zero-padded by `padding`."""
+    """Applies the separable Gaussian window to each map, zero-padded by `padding`."""
     if backend.compiled:
         return backend.kernel(correlate, 1)(backend.kernel(correlate, 2)(pad(maps, (padding,) * 4)))
     rows = correlate(pad(maps, (padding, padding)), 2)
@@ -30,10 +30,7 @@ def blur(maps: Float[Tensor, "M H W"], padding: int, backend: Backend = EAGER) -
 def ssim_map(
     image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], padding: int = PADDING, backend: Backend = EAGER
 ) -> Float[Tensor, "C h w"]:
-    """Structural similarity per channel and pixel; biased variances.
-
-    `padding` is 5 for INRIA's zero-padded windows, 0 for whole windows only.
-    """
+    """Returns SSIM per channel and pixel, with biased variances; `padding`: 5 (3D-GS) or 0 for whole windows only."""
     luminance, structure, *_ = similarity(*blurred(image, target, padding, backend))
     return luminance * structure
 
@@ -45,7 +42,7 @@ def blurred(
     backend: Backend = EAGER,
     target_moments: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, ...]:
-    """Blurred image, target, image^2, target^2 and image target, each [C h w]; target_moments: `moments_of` it."""
+    """Returns blurred image, target, image^2, target^2 and image target, each [C h w]."""
     x, xx, xy = (blur(each, padding, backend) for each in (image, image * image, image * target))
     y, yy = moments_of(target, padding, backend) if target_moments is None else target_moments
     return x, y, xx, yy, xy
@@ -54,12 +51,12 @@ def blurred(
 def moments_of(
     target: Float[Tensor, "C H W"], padding: int = PADDING, backend: Backend = EAGER
 ) -> tuple[Float[Tensor, "C h w"], Float[Tensor, "C h w"]]:
-    """Blurred target and target^2: what SSIM takes of a target alone."""
+    """Returns blurred target and target^2, the terms of SSIM that depend on the target alone."""
     return blur(target, padding, backend), blur(target * target, padding, backend)
 
 
 def volume_loss(scales: Float[Tensor, "N 3"], weight: float) -> Float[Tensor, ""]:
-    """`weight` times the mean product of the three scales; 0 for no splat (Scaffold-GS, train.py)."""
+    """Returns `weight` times the mean product of the three scales; 0 without splats (Scaffold-GS, train.py)."""
     volumes = scales.prod(1)
     return weight * volumes.sum() / max(1, len(volumes))
 
@@ -71,8 +68,7 @@ def photometric_and_gradient(
     backend: Backend = EAGER,
     target_moments: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "C H W"]]:
-    """The photometric loss and its gradient by the image. The blur is its own adjoint: the window is symmetric and the
-    padding zero."""
+    """Returns the loss and its gradient by the image; the blur, symmetric and zero-padded, is its own adjoint."""
     parts = blurred(image, target, PADDING, backend, target_moments)
     ssim, *slopes = backend.kernel(ssim_slopes)(*(part.flatten() for part in parts))
     back = [blur(slope.view(image.shape), PADDING, backend).flatten() for slope in slopes]
@@ -82,7 +78,7 @@ def photometric_and_gradient(
 
 
 class Photometric(torch.autograd.Function):
-    """The loss, with its gradient found on the way forward."""
+    """Autograd function of the photometric loss; the forward pass computes the gradient."""
 
     @staticmethod
     def forward(ctx, image, target, ssim_weight, backend, target_moments):
@@ -108,10 +104,13 @@ def photometric(
     backend: Backend = EAGER,
     target_moments: tuple[Tensor, Tensor] | None = None,
 ) -> Float[Tensor, ""]:
-    """(1 - w) mean |I - G| + w (1 - SSIM), a mean over pixels and channels; differentiable once, in the image.
+    """Returns (1 - w) mean |I - G| + w (1 - SSIM) over pixels and channels; differentiable once, in the image.
 
     Args:
+        image: Render I, display values.
+        target: Photo G, display values.
+        ssim_weight: w, in [0, 1].
         backend: `RasterSettings.backend.on(device, learning=True)`.
-        target_moments: `moments_of` the target, where they are known. Compiled code of a GPU needs none.
+        target_moments: Cached `moments_of` the target; unused by compiled code on a GPU.
     """
     return Photometric.apply(image, target, ssim_weight, backend, target_moments)

@@ -1,4 +1,4 @@
-"""PSNR and SSIM by their published definitions (3D-GS, metrics.py). Images are display values in [0, 1]."""
+"""PSNR and SSIM as published (3D-GS, metrics.py). Images are display values in [0, 1]."""
 
 import math
 
@@ -13,25 +13,24 @@ from gsx.core.shapes import Bool, Float
 
 SSIM_VARIANTS = ("inria", "torchmetrics", "valid")
 STRIP_PIXELS = 1 << 16
-"""Pixels whose SSIM is taken at once: nine maps of them are 2.4 MB."""
+"""Pixels per strip of SSIM; nine maps of a strip take 2.4 MB."""
 
 
 def quantise(image: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
-    """Rounded to 8 bits as a saved PNG would be: x 255, + 0.5, clamp, truncate."""
+    """Rounds to 8 bits as in a saved PNG: x 255, + 0.5, clamp, truncate."""
     return (image * 255 + 0.5).clamp(0, 255).floor() / 255
 
 
 def psnr(
     image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], counted: Bool[Tensor, "H W"] | None = None
 ) -> float:
-    """20 log10(1 / sqrt(MSE)) over all channels of the pixels that count (None: all), dB; inf for equal images, nan
-    where none counts."""
+    """Returns the PSNR of the pixels that count (None: all), dB; inf for equal images, nan for no pixels."""
     squares = (image.double() - target.double()).square()
     return decibel(float((squares if counted is None else squares[:, counted.to(squares.device)]).mean()))
 
 
 def decibel(mean_square: float) -> float:
-    """20 log10(1 / sqrt(mean square)), dB; inf for 0, nan for nan."""
+    """Returns -10 log10(mean square), dB; inf for 0, nan for nan."""
     return math.inf if mean_square == 0 else -10 * math.log10(mean_square)
 
 
@@ -42,22 +41,20 @@ def ssim(
     counted: Bool[Tensor, "H W"] | None = None,
     backend: Backend = EAGER,
 ) -> float:
-    """Structural similarity in [-1, 1], a mean over windows around pixels that count (None: all); nan where none does.
+    """Returns the mean SSIM, in [-1, 1], over windows around pixels that count (None: all); nan for no pixels.
 
-    They differ near borders. `inria`: zero-padded windows, mean over the whole map, as in the 3D-GS release.
-    `torchmetrics`: the same with reflected borders (repeated, where too narrow), as torchmetrics since 1.5. `valid`:
-    mean over the pixels whose window lies inside, as the original SSIM and pytorch-msssim. `backend`: of the loops.
+    Variants differ at borders. `inria`: zero padding, as 3D-GS. `torchmetrics`: reflected borders (repeated in narrow
+    images), as torchmetrics since 1.5. `valid`: only windows inside the image, as the original SSIM.
     """
-    if variant == "inria":
-        return whole_windows(pad(image, (WINDOW // 2,) * 4), pad(target, (WINDOW // 2,) * 4), counted, backend)
-    if variant == "torchmetrics":
-        half, mode = WINDOW // 2, "reflect" if min(image.shape[1:]) > WINDOW // 2 else "replicate"
-        padded_image, padded_target = (pad(picture, (half,) * 4, mode=mode) for picture in (image, target))
-        return whole_windows(padded_image, padded_target, counted, backend)
+    if variant not in SSIM_VARIANTS:
+        raise ValueError(f"SSIM variant '{variant}' is unknown; choose from {', '.join(SSIM_VARIANTS)}")
+    half = WINDOW // 2
     if variant == "valid":
-        inner = slice(WINDOW // 2, -(WINDOW // 2))
-        return whole_windows(image, target, None if counted is None else counted[inner, inner], backend)
-    raise ValueError(f"SSIM variant '{variant}' is unknown; choose from {', '.join(SSIM_VARIANTS)}")
+        return whole_windows(image, target, None if counted is None else counted[half:-half, half:-half], backend)
+    reflected = "reflect" if min(image.shape[1:]) > half else "replicate"
+    mode = "constant" if variant == "inria" else reflected
+    image, target = (pad(picture, (half,) * 4, mode=mode) for picture in (image, target))
+    return whole_windows(image, target, counted, backend)
 
 
 def whole_windows(
@@ -66,10 +63,9 @@ def whole_windows(
     counted: Bool[Tensor, "h w"] | None,
     backend: Backend,
 ) -> float:
-    """Mean SSIM where the window fits, its middle counts; pictures smaller than a window are extended by their border
-    first, and then count everywhere.
+    """Returns the mean SSIM over whole windows whose middle counts, in strips of rows that fit the CPU's cache.
 
-    In strips of rows, so that its maps stay in the CPU's cache.
+    Pictures smaller than a window are extended by their border, and then count everywhere.
     """
     if counted is not None and not counted.any():
         return math.nan
@@ -89,6 +85,6 @@ def whole_windows(
 
 
 def bicubic(image: Float[Tensor, "C H W"], width: int, height: int) -> Float[Tensor, "C height width"]:
-    """Resized by Keys' cubic interpolation, antialiased, clamped to [0, 1]: the naive competitor of a zoomed render."""
+    """Resizes by antialiased cubic interpolation, clamped to [0, 1]: the simplest baseline of a zoomed render."""
     larger = torch.nn.functional.interpolate(image[None], size=(height, width), mode="bicubic", antialias=True)
     return larger[0].clamp(0, 1)

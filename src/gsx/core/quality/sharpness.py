@@ -1,8 +1,7 @@
-"""How sharp photographs are, told from the photographs alone.
+"""Sharpness of photos, relative to their neighbours.
 
-Blur takes fine contrast away and leaves coarse contrast, and where the camera moved it does so along one axis. The
-ratio of both, along the axis that has less of it, is alike for photographs of one capture: compared with its
-neighbours, a photograph that moved by three pixels has half of it or less (docs/explanation/photo-corrections.md).
+Blur reduces fine contrast but not coarse contrast; motion blur along one axis. The ratio of both, on the axis where it
+is lower, is similar in all photos of a capture; motion by 3 px halves it (docs/explanation/photo-corrections.md).
 """
 
 import math
@@ -19,17 +18,17 @@ from gsx.core.data.images import read_image
 from gsx.core.shapes import Float, UInt8
 
 COARSE = 4
-"""Pixels that are averaged to one of the coarse picture."""
+"""Edge of the pixel blocks averaged for coarse contrast."""
 NEIGHBOURS = 3
-"""On each side, in the order of names."""
+"""Neighbours on each side, in the order of names."""
 BLURRED = 0.6
-"""Of what neighbours have. Three captures of 181 photographs are at 0.67 or above, blurred by 3 px at 0.58 or below."""
+"""Largest ratio of a blurred photo. 181 photos of three captures have 0.67 or more; blurred by 3 px, 0.58 or less."""
 LEAST_SIDE = 64
-"""Smaller photographs show no coarse contrast, px."""
+"""Least side of a photo for the measurement, px."""
 
 
 def fineness(photo: UInt8[Tensor, "C H W"]) -> Float[Tensor, "2"]:
-    """Fine contrast by coarse contrast down the rows and along them; nan for what has no contrast or is too small."""
+    """Returns fine by coarse contrast, vertical and horizontal; nan without contrast or for small photos."""
     grey = photo[:3].float().mean(0)
     if min(grey.shape) < LEAST_SIDE:
         return torch.full((2,), torch.nan)
@@ -38,13 +37,13 @@ def fineness(photo: UInt8[Tensor, "C H W"]) -> Float[Tensor, "2"]:
 
 
 def curvature(grey: Float[Tensor, "H W"], axis: int) -> Float[Tensor, ""]:
-    """Variance of second differences along an axis."""
+    """Returns the variance of second differences along an axis."""
     inner = grey.shape[axis] - 2
     return (grey.narrow(axis, 2, inner) + grey.narrow(axis, 0, inner) - 2 * grey.narrow(axis, 1, inner)).var()
 
 
 def against_neighbours(values: Float[Tensor, "N 2"]) -> Float[Tensor, "N"]:
-    """`fineness` of each photograph divided by the median of its neighbours, the lesser of both axes; nan: unknown."""
+    """Returns `fineness` by the neighbours' median, the lower of both axes; nan: unknown."""
     out = torch.full((len(values),), torch.nan)
     for number in range(len(values)):
         before, after = values[max(0, number - NEIGHBOURS) : number], values[number + 1 : number + 1 + NEIGHBOURS]
@@ -55,12 +54,7 @@ def against_neighbours(values: Float[Tensor, "N 2"]) -> Float[Tensor, "N"]:
 
 
 def sharpness(photos: Sequence[Path]) -> dict[Path, float]:
-    """What each photograph has of its neighbours' fineness, in their order; those of which nothing is known are left
-    out.
-
-    Raises:
-        InputError: one cannot be read.
-    """
+    """Returns `against_neighbours` of each photo in order, without unknown ones; InputError: one cannot be read."""
     if not photos:
         return {}
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
@@ -70,16 +64,12 @@ def sharpness(photos: Sequence[Path]) -> dict[Path, float]:
 
 
 def blurred(ratios: Mapping[Path, float]) -> list[tuple[Path, float]]:
-    """Return (photograph, ratio) of those that are blurred, worst first; ratios: as of `sharpness`."""
+    """Returns the blurred photos and their `sharpness`, worst first."""
     return sorted(((path, ratio) for path, ratio in ratios.items() if ratio < BLURRED), key=lambda pair: pair[1])
 
 
 def sharpness_line(photos: Sequence[Path]) -> str:
-    """Return what to photograph again, for `gsx scenes`.
-
-    Raises:
-        InputError: a photograph cannot be read.
-    """
+    """Returns the line on blurred photos for `gsx scenes`; InputError: one cannot be read."""
     known = sharpness(sorted(photos))
     found, rest = blurred(known), len(photos) - len(known)
     unknown = f"; {rest} have too few pixels or too little contrast to compare" if rest else ""

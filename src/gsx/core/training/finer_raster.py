@@ -58,7 +58,7 @@ class FinerRaster:
 
     def reduced(self, image: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
         """Returns the picture reduced from its finer render; differentiable, not clamped."""
-        return image if self.times == 1 else self.window.cut(self.reduction.formed(image, self.times))
+        return image if self.times == 1 else self.window.cut(self.reduction.unclamped(image, self.times))
 
 
 def finer_raster(camera: Camera, reduction: Reduction, times: int) -> FinerRaster:

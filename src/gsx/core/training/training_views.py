@@ -29,13 +29,10 @@ class TrainingViews:
     @property
     def full_size(self) -> Sequence[View]:
         """Training views at the photos' own resolution, with corrected poses and masks."""
-        return self._transformed(None)
+        return self.at(None)
 
-    def at(self, step: int) -> Sequence[View]:
-        """Returns the training views of a step."""
-        return self._transformed(step)
-
-    def _transformed(self, step: int | None) -> Sequence[View]:
+    def at(self, step: int | None) -> Sequence[View]:
+        """Returns the training views of a step; None: `full_size`."""
         views: Sequence[View] = self.scene.train
         for module in self.modules.values():
             views = module.transform_views(views, step)
