@@ -4,6 +4,7 @@ Use `steps: Annotated[int, Range(1, 100)]` in a dataclass of options, or a name 
 every number. Ends are included.
 """
 
+import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, is_dataclass
 from typing import Annotated, Any, get_args, get_type_hints
@@ -68,6 +69,7 @@ def numbers_in(value: Any) -> list[float]:
     return [number for number in several if isinstance(number, int | float)]
 
 
+@functools.cache
 def field_ranges(options: type) -> dict[str, tuple[list[type], Range | None]]:
     """Returns, by field of a dataclass, its nested dataclasses and the range of its numbers."""
     found = {}

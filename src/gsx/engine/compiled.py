@@ -18,9 +18,8 @@ from torch import Tensor
 from gsx.core.rasterizer.composite import composite_eager
 from gsx.core.rasterizer.grid import Basis, TileGrid, basis_of, inside_of
 from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
-from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.projection import ScreenSplats
-from gsx.core.rasterizer.settings import NOTHING, RasterSettings
+from gsx.core.rasterizer.settings import NOTHING, Precision, RasterSettings
 from gsx.core.shapes import Float, Int
 from gsx.engine.backend import COMPILED
 from gsx.engine.compile_cache import recording

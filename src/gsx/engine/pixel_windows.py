@@ -20,9 +20,8 @@ from gsx.core.errors import ConfigError
 from gsx.core.rasterizer.composite import sum_by_splat
 from gsx.core.rasterizer.grid import TileGrid, pixel_centres
 from gsx.core.rasterizer.intersections import TileIntersections
-from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.projection import ScreenSplats
-from gsx.core.rasterizer.settings import RasterSettings
+from gsx.core.rasterizer.settings import Precision, RasterSettings
 from gsx.core.shapes import Float, Int
 
 NARROW = 0.1

@@ -13,7 +13,7 @@ from torch import Tensor
 from gsx.core.rasterizer.bags import bag_sums, edges_of
 from gsx.core.rasterizer.grid import TileGrid, basis_of
 from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
-from gsx.core.rasterizer.precision import Precision
+from gsx.core.rasterizer.settings import Precision
 from gsx.core.shapes import Float, Int
 from gsx.engine.compiling import fused
 from gsx.engine.kernels import TABLE, Rules

@@ -122,7 +122,7 @@ def test_every_pair_of_formats_keeps_the_dtype_of_the_splats(
         ({"jacobian_margin": -0.1}, "jacobian_margin is -0.1"),
         ({"tile_size": 32}, "tile_size is 32; with cull=published it must divide 16"),
         ({"tile_size": 0, "cull": "tight"}, "tile_size is 0"),
-        ({"chunk": 0}, "at least 1"),
+        ({"chunk": 0}, "chunk is 0; give a number from 1"),
         ({"tile_cap": -1}, "tile_cap is -1"),
     ],
 )

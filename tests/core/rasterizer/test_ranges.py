@@ -9,8 +9,7 @@ from raster_scenes import changed, errors_of, front_camera, leaves, random_splat
 from gsx.core.data.camera import look_at
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.rasterizer.cap import capped
-from gsx.core.rasterizer.intersections import intersect_tiles
+from gsx.core.rasterizer.intersections import capped, intersect_tiles
 from gsx.core.rasterizer.projection import project
 
 

@@ -18,6 +18,4 @@ def fit_colours(
     mask = mask.to(image.device)
     rows = torch.cat([image, torch.ones_like(image[:1])])[:, mask].double().T.cpu()
     target = truth[:, mask].double().T.cpu()
-    return (
-        torch.linalg.lstsq(rows, target, driver="gelsd").solution.T.float().to(image.device)
-    )  # least norm
+    return torch.linalg.lstsq(rows, target, driver="gelsd").solution.T.float().to(image.device)  # least norm

@@ -1,4 +1,4 @@
-"""The one rasterizer every backbone renders through: project, pair with tiles, sort, composite. Needs only torch."""
+"""Rasterizer of all backbones, in plain torch: project, intersect with tiles, sort, composite."""
 
 import torch
 
@@ -26,5 +26,5 @@ __all__ = [
 ]
 
 torch.exp(torch.zeros(1))
-"""MKL sets its vector functions up in the first call. Where two threads make that call at once, the second now and then
-computes its half with seven bits fewer (exp, log, sin; torch 2.13): so the first call is made here, by one thread."""
+"""MKL initialises its vector functions in the first call. If two threads make it at once, one may lose seven bits (exp,
+log, sin; torch 2.13), so one thread makes it here."""

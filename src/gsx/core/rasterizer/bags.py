@@ -1,4 +1,4 @@
-"""Sums over the entries of a list, row by row, always in the same order."""
+"""Sums over the entries of a list, row by row, in a fixed order."""
 
 import torch
 from torch import Tensor
@@ -8,7 +8,7 @@ from gsx.core.shapes import Float, Int
 
 
 def edges_of(counts: Int[Tensor, "N"]) -> Int[Tensor, "N_1"]:
-    """Where each row of a list begins that has so many entries, and where the last one ends."""
+    """Returns the first entry of each row with that many entries, then the end of the last."""
     ends = counts.cumsum(0)
     return torch.cat([torch.zeros_like(ends[:1]), ends])
 
@@ -19,6 +19,6 @@ def bag_sums(values: Float[Tensor, "E V"], places: Int[Tensor, "P"], edges: Int[
 
 
 def runs_added(values: Float[Tensor, "M V"], ids: Int[Tensor, "M"], count: int) -> Float[Tensor, "N V"]:
-    """Row n is the sum of the values whose id is n; ids ascend. Always in the same order, without asking the device."""
+    """Sums the values of each id into a row; ids ascend. Does not wait for the device."""
     rows = torch.arange(count + 1, device=ids.device, dtype=ids.dtype)
     return bag_sums(values, torch.arange(len(ids), device=ids.device), torch.searchsorted(ids, rows))

@@ -1,6 +1,6 @@
-"""Tiles that splats may reach, splat by splat and row of tiles by row. Nothing here is differentiated.
+"""Tiles that splats reach: bounding boxes, and spans of columns on each row. Nothing here is differentiated.
 
-Numbers of one splat lie in columns (see geometry.py); a box is (first, past the last) tile along an axis.
+Vectors are columns (see geometry.py); a box is (first, past-the-last) tile along an axis.
 """
 
 import math
@@ -12,11 +12,11 @@ from gsx.core.rasterizer.settings import CUTOFF_SLACK, WINDOW_TILE
 from gsx.core.shapes import Float, Int
 
 FAR = 1 << 20
-"""Pixels and tiles farther out than any raster; keeps integers in range."""
+"""Bound of pixel and tile indices, beyond any raster; keeps integers in range."""
 
 
 def three_sigma(xx: Float[Tensor, "M"], xy: Float[Tensor, "M"], yy: Float[Tensor, "M"]) -> Float[Tensor, "M"]:
-    """3 sqrt(lambda_max) of covariances with the published floor of 0.1 under the inner root (3D-GS, forward.cu)."""
+    """Returns 3 sqrt(lambda_max) of covariances, with the published floor of 0.1 in the root (3D-GS, forward.cu)."""
     half = (xx - yy) / 2
     return 3 * ((xx + yy) / 2 + (half * half + xy * xy).clamp_min(0.1).sqrt()).sqrt()
 
@@ -24,8 +24,10 @@ def three_sigma(xx: Float[Tensor, "M"], xy: Float[Tensor, "M"], yy: Float[Tensor
 def window(
     mean: Float[Tensor, "M"], radius: Float[Tensor, "M"], tiles: Int[Tensor, ""]
 ) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"]]:
-    """First and past-the-last pixel along an axis of the 16 px tiles that 3D-GS assigns to a splat; `tiles`: how many
-    the frame has (3D-GS, forward.cu)."""
+    """Returns first and past-the-last pixel of a splat's published 16 px tiles along an axis (3D-GS, forward.cu).
+
+    `tiles`: number of such tiles on the frame.
+    """
     corner = mean - 0.5  # the published mean is relative to integer pixel positions
     edges = (corner - radius, corner + radius + (WINDOW_TILE - 1))
     first, last = ((edge / WINDOW_TILE).nan_to_num().clamp(0, FAR).int().minimum(tiles) for edge in edges)
@@ -33,7 +35,7 @@ def window(
 
 
 def touched(edge: Float[Tensor, "*M"], tile: int, past: bool = False) -> Int[Tensor, "*M"]:
-    """Tile of the first pixel centre at or right of `edge`; with `past`, one past that of the last at or left of it."""
+    """Returns the tile of the first pixel centre >= `edge`; `past`: one past the tile of the last centre <= `edge`."""
     pixel = (edge - 0.5).floor() if past else (edge - 0.5).ceil()
     return (pixel / tile).floor().clamp(-FAR, FAR).nan_to_num().int() + int(past)
 
@@ -47,7 +49,7 @@ def box(
     tile: int,
     reach: float,
 ) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"]]:
-    """First and past-the-last tile of a splat's bounding box along an axis, on the frame, cut to the raster's."""
+    """Returns first and past-the-last tile of a splat's bounding box along an axis, on the frame, inside the raster."""
     half = (2 * limit.clamp_min(0) * variance).sqrt() + reach
     first = touched(mean - half, tile).maximum(begin)
     last = touched(mean + half, tile, past=True).minimum(end)
@@ -66,15 +68,14 @@ def boxes(
 ) -> tuple[
     Int[Tensor, "M"], Int[Tensor, "M"], Int[Tensor, "M"], Int[Tensor, "M"], Int[Tensor, "M"], Float[Tensor, "M"]
 ]:
-    """(first column, first row, past the last column, past the last row, published radius or 0, limit of s^2 + r^2) of
-    every splat.
+    """Returns first column and row, past-the-last column and row, published radius or 0, and limit of s^2 + r^2.
 
-    `raster` holds for either axis: 16 px tiles of the frame, first and past-the-last pixel of the raster, first and
-    past-the-last tile. `windowed`: a splat reaches only the 16 px tiles of its 3-sigma square.
+    `raster` holds for each axis: 16 px tiles of the frame, first and past-the-last pixel and tile of the raster.
+    `windowed`: a splat reaches only the 16 px tiles of its 3-sigma square.
     """
     (xx, xy, yy), limit = covariances.unbind(1), log_opacities - math.log(alpha_min) + CUTOFF_SLACK
     radius, edges = three_sigma(xx, xy, yy).ceil(), []
-    seen = torch.ones_like(radius, dtype=torch.bool)
+    visible = torch.ones_like(radius, dtype=torch.bool)
     for mean, variance, numbers in zip(means.unbind(1), (xx, yy), raster.unbind(), strict=True):
         tiles, first_pixel, past_pixel, begin, end = numbers.unbind()
         first, last = box(mean, variance, limit, begin, end, tile, reach)
@@ -82,9 +83,9 @@ def boxes(
         if windowed:
             first = first.maximum(left // tile)
             last = last.minimum(right // tile).maximum(first)
-        seen = seen & (right.minimum(past_pixel) > left.maximum(first_pixel))
+        visible = visible & (right.minimum(past_pixel) > left.maximum(first_pixel))
         edges.append((first, last))
-    radii = torch.where(seen, radius, 0.0).nan_to_num().clamp_max(FAR).int()
+    radii = torch.where(visible, radius, 0.0).nan_to_num().clamp_max(FAR).int()
     (first_column, last_column), (first_row, last_row) = edges
     return first_column, first_row, last_column, last_row, radii, limit
 
@@ -98,8 +99,7 @@ def row_spans(
     tile: int,
     reach: float = 0.0,
 ) -> tuple[Int[Tensor, "R"], Int[Tensor, "R"]]:
-    """First and past-the-last column (counted on the frame) at which the ellipse s^2 + r^2 <= limit meets a tile row,
-    or comes as near to its outermost pixel centres as `reach` px.
+    """Returns first and past-the-last column, of the frame, where s^2 + r^2 <= limit within `reach` px of a tile row.
 
     Exact: the part of an ellipse between two lines is convex, so its tiles on the row are those of its x-interval.
     """
@@ -127,10 +127,15 @@ def spans(
     tile: int,
     reach: float,
 ) -> tuple[Int[Tensor, "R"], Int[Tensor, "R"], Int[Tensor, "R"]]:
-    """(tile row, first column, number of columns) of every row of tiles of V splats; `rank`: its splat.
+    """Returns tile row, first column and number of columns of each row of tiles of V splats.
 
-    `shapes`: mean x, mean y, u0, u1, u2, limit; `sides`: first row, first and past-the-last column; `starts`: number
-    of a splat's first row in the list.
+    Args:
+        rank: Splat of each row.
+        shapes: Mean x, mean y, u0, u1, u2, limit.
+        sides: First row, first and past-the-last column.
+        starts: Index of each splat's first row.
+        tile: Edge of the tiles, px.
+        reach: As for `row_spans`.
     """
     mean_x, mean_y, u0, u1, u2, limit = (column[rank] for column in shapes.unbind(1))
     top, left, right = (column[rank] for column in sides.unbind(1))

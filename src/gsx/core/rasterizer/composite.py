@@ -1,12 +1,10 @@
 """Front-to-back blending over tiles and its gradient, in O(pairs + pixels) memory.
 
-exponent.py writes ln alpha, precision.py names the number formats.
-
 The list of a tile is cut into blocks of K splats, the last one padded. Tiles are taken in batches of similar list
 length; a batch blends one block of each of its tiles at a time, front to back; tiles whose list has ended or whose
 pixels have all stopped leave the batch. The backward pass recomputes alphas from the transmittance saved before each
-block and walks back to front, so that the colour behind a splat is a sum of small terms, never a difference of large
-ones. The work on a batch's blocks is a function of dense [B, K, P] arrays: B tiles, K splats, P pixels of a tile.
+block, back to front, so that the colour behind a splat is a sum of small terms, not a difference of large ones. Blocks
+are dense [B, K, P] arrays: B tiles, K splats, P pixels of a tile. exponent.py has ln alpha.
 """
 
 import math
@@ -25,18 +23,17 @@ from gsx.core.rasterizer.exponent import (
 )
 from gsx.core.rasterizer.grid import TileGrid, pixel_centres
 from gsx.core.rasterizer.intersections import TileIntersections
-from gsx.core.rasterizer.precision import Precision
 from gsx.core.rasterizer.projection import ScreenSplats
-from gsx.core.rasterizer.settings import NOTHING, RasterSettings
+from gsx.core.rasterizer.settings import NOTHING, Precision, RasterSettings
 from gsx.core.shapes import Float, Int
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Blocks:
-    """Lists of all tiles in blocks of K, tile after tile."""
+    """Lists of all tiles, cut into blocks of K entries."""
 
     splats: Int[Tensor, "S K"]
-    """Row of the screen splat; M, one past the last, is padding."""
+    """Row of the screen splat; M is padding."""
     tiles: Int[Tensor, "S"]
     """Tile of each block."""
     starts: Int[Tensor, "T"]
@@ -46,7 +43,7 @@ class Blocks:
 
 
 def make_blocks(intersections: TileIntersections, chunk: int, splats: int) -> Blocks:
-    """Cut each tile's list into blocks of `chunk`; `splats` is the number M of screen splats."""
+    """Cuts each tile's list into blocks of `chunk` entries; `splats`: number M of screen splats."""
     lengths = intersections.starts.diff()
     counts = (lengths + (chunk - 1)) // chunk
     tiles = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
@@ -61,17 +58,17 @@ def make_blocks(intersections: TileIntersections, chunk: int, splats: int) -> Bl
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Tables:
-    """What blending reads, block by block."""
+    """Input of blending, by block."""
 
     rows: Float[Tensor, "S K V"]
-    """What the exponent reads of every list entry, in the exact dtype."""
+    """Rows of `exponent_rows` for each list entry, in the exact dtype."""
     offsets: Float[Tensor, "S K 2"]
     """Mean relative to the tile's centre, px."""
     channels: Float[Tensor, "S K C"]
     basis: Float[Tensor, "3 P"]
-    """(x, y, 1) at the pixels of a tile, in the dtype of evaluation."""
+    """(x, y, 1) at the pixels of a tile, in the evaluation dtype."""
     inside: Float[Tensor, "T P"]
-    """1 at pixels of the raster, 0 at those of border tiles beyond it."""
+    """1 at pixels of the raster, 0 outside it."""
     settings: RasterSettings
     precision: Precision
 
@@ -85,7 +82,7 @@ def make_tables(
     grid: TileGrid,
     settings: RasterSettings,
 ) -> Tables:
-    """Gather what every list entry needs; padding draws nothing. A channel of ones, for coverage, is appended."""
+    """Gathers the input of each list entry, with invisible padding and a channel of ones for coverage."""
     features = torch.cat([means, conic_factors, log_opacities[:, None], channels, torch.ones_like(means[:, :1])], 1)
     nothing = means.new_zeros(1, features.shape[1])
     nothing[0, 5] = NOTHING
@@ -107,26 +104,26 @@ def make_tables(
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """One block of each of B tiles, as the forward pass met them."""
+    """One block of each of B tiles in the forward pass."""
 
     tiles: Int[Tensor, "B"]
     blocks: Int[Tensor, "B"]
     transmittance: Float[Tensor, "B P"]
-    """Of every pixel before the block; below the stop value: the pixel has ended."""
+    """Transmittance of each pixel before the block; below the stop value, the pixel has ended."""
 
 
 # -- mathematics of a [B, K, P] batch ------------------------------------------------------------------------------
 
 
 def alphas_(gaussian: Float[Tensor, "B K P"], settings: RasterSettings) -> Float[Tensor, "B K P"]:
-    """In place: clamped at alpha_max, zero below alpha_min (3D-GS, renderCUDA)."""
+    """Clamps at alpha_max and zeroes below alpha_min, in place (3D-GS, renderCUDA)."""
     least = torch.tensor(settings.alpha_min, dtype=gaussian.dtype)
     below = float(torch.nextafter(least, torch.tensor(-math.inf, dtype=gaussian.dtype)))  # "> below" means ">= least"
     return torch.threshold_(gaussian.clamp_(max=settings.alpha_max), below, 0.0)
 
 
 def transmittances(alpha: Float[Tensor, "B K P"], start: Float[Tensor, "B P"]) -> Float[Tensor, "B K_plus_1 P"]:
-    """Transmittance before each splat and, last, behind all of them."""
+    """Returns the transmittance before each splat and, last, behind all."""
     values = alpha.new_empty(alpha.shape[0], alpha.shape[1] + 1, alpha.shape[2])
     current, *others = values.unbind(1)
     current.copy_(start)
@@ -137,13 +134,13 @@ def transmittances(alpha: Float[Tensor, "B K P"], start: Float[Tensor, "B P"]) -
 
 
 def stop_(alpha: Float[Tensor, "B K P"], transmittance: Float[Tensor, "B K_plus_1 P"], stop: float) -> None:
-    """In place: zero the alphas of the splat that would take its pixel below `stop`, and of those behind it."""
+    """Zeroes the alphas of the splat that takes its pixel below `stop`, and of those behind it, in place."""
     if bool(transmittance[:, -1].amin() < stop):
         alpha.mul_(transmittance[:, 1:] >= stop)
 
 
 def blend(tables: Tables, front: Front) -> tuple[Float[Tensor, "B P C"], Float[Tensor, "B P"], Tensor]:
-    """Light that the blocks add, the transmittance behind them, and the blending weights [B, K, P]."""
+    """Returns the colour that the blocks add, the transmittance behind them, and the blending weights [B, K, P]."""
     log_alpha, _ = log_alphas(tables.rows.index_select(0, front.blocks), tables.basis)
     alpha = alphas_(log_alpha.exp_(), tables.settings).to(tables.precision.accumulation)
     transmittance = transmittances(alpha, front.transmittance)
@@ -154,7 +151,7 @@ def blend(tables: Tables, front: Front) -> tuple[Float[Tensor, "B P C"], Float[T
 
 
 def unclamp_(slope: Tensor, gaussian: Tensor, settings: RasterSettings) -> None:
-    """In place: the straight-through gradient of min(alpha_max, .), as in the published backward (3D-GS)."""
+    """Applies the straight-through gradient of min(alpha_max, .), in place (3D-GS, backward.cu)."""
     if bool(gaussian.amax() > settings.alpha_max):
         slope.mul_((gaussian / settings.alpha_max).clamp_(min=1.0))
 
@@ -162,7 +159,7 @@ def unclamp_(slope: Tensor, gaussian: Tensor, settings: RasterSettings) -> None:
 def contribution_behind(
     contribution: Float[Tensor, "B K P"], rest: Float[Tensor, "B P"]
 ) -> Float[Tensor, "B K_plus_1 P"]:
-    """First the sum of the whole block and `rest`, the colour behind it; then the sum behind each splat."""
+    """Returns the sum of `rest` and the block, then the sum behind each splat."""
     values = contribution.new_empty(contribution.shape[0], contribution.shape[1] + 1, contribution.shape[2])
     *others, current = values.unbind(1)
     current.copy_(rest)
@@ -177,7 +174,7 @@ class FrontGradient:
     """Gradients of B blocks, and the colour of the blocks and all behind them."""
 
     rows: Float[Tensor, "B K 6"]
-    """As `row_gradient` returns it."""
+    """From `row_gradient`."""
     channels: Float[Tensor, "B K C"]
     absolute: Float[Tensor, "B K 2"] | None
     """Sum over pixels of the absolute gradient of the mean, per axis."""
@@ -187,7 +184,7 @@ class FrontGradient:
 def front_gradient(
     tables: Tables, front: Front, gradient: Float[Tensor, "B C P"], rest: Float[Tensor, "B P"], absolute: bool
 ) -> FrontGradient:
-    """Gradient of a front; `rest` is the colour behind it, weighted by the gradient of the picture."""
+    """Returns the gradient of a front; `rest`: colour behind it, times the gradient of the picture."""
     rows = tables.rows.index_select(0, front.blocks)
     log_alpha, kept = log_alphas(rows, tables.basis)
     gaussian, exact = log_alpha.exp_(), tables.precision.exact
@@ -213,7 +210,7 @@ def front_gradient(
 
 
 def batches(blocks: Blocks, settings: RasterSettings) -> list[Int[Tensor, "B"]]:
-    """Tiles that have a list, longest first, in batches that hold about `batch_values` alphas at once."""
+    """Returns tiles with splats, longest list first, in batches of about `batch_values` alphas."""
     order = torch.argsort(blocks.counts, descending=True, stable=True)[: int((blocks.counts > 0).sum())]
     return list(order.split(max(1, settings.batch_values // (settings.chunk * settings.tile_size**2))))
 
@@ -221,7 +218,7 @@ def batches(blocks: Blocks, settings: RasterSettings) -> list[Int[Tensor, "B"]]:
 def walk(
     tables: Tables, blocks: Blocks, tiles: Int[Tensor, "B"]
 ) -> Iterator[tuple[Front, Float[Tensor, "B P C"], Float[Tensor, "B K P"]]]:
-    """(front, accumulated colour, weights) of a batch of tiles, front to back."""
+    """Yields (front, added colour, weights) of a batch of tiles, front to back."""
     transmittance = tables.inside[tiles]
     number = 0
     while len(tiles):
@@ -237,9 +234,9 @@ def walk(
 def blend_all(
     tables: Tables, blocks: Blocks, keep: bool, max_weights: Float[Tensor, "S K"] | None
 ) -> tuple[Float[Tensor, "T P C"], list[Front]]:
-    """Blend every tile; returns the tiles and, if `keep`, the fronts for the backward pass.
+    """Blends all tiles and returns them; with `keep`, also the fronts for the backward pass.
 
-    `max_weights`, where given, receives each list entry's largest blending weight.
+    `max_weights` receives each list entry's largest blending weight, unless it is None.
     """
     pictures = tables.channels.new_zeros(len(blocks.counts), tables.basis.shape[1], tables.channels.shape[2])
     fronts: list[Front] = []
@@ -256,14 +253,14 @@ def blend_all(
 def all_gradients(
     tables: Tables, fronts: list[Front], gradient: Float[Tensor, "T C P"], absolute: bool
 ) -> tuple[Float[Tensor, "S K 6"], Float[Tensor, "S K C"], Float[Tensor, "S K 2"] | None]:
-    """Gradients of every list entry: of its row, its channels and, if asked, the absolute one of its mean."""
+    """Returns each list entry's gradients: of its row, its channels and, with `absolute`, the absolute one of its mean."""
     shape, of_pair = tables.rows.shape[:2], tables.rows
     rest = gradient.new_zeros(gradient.shape[0], gradient.shape[2])
     rows, channels = of_pair.new_zeros(*shape, 6), of_pair.new_zeros(*shape, tables.channels.shape[2])
     means = of_pair.new_zeros(*shape, 2) if absolute else None
     for front in reversed(fronts):
-        seen, behind = gradient.index_select(0, front.tiles), rest.index_select(0, front.tiles)
-        part = front_gradient(tables, front, seen, behind, absolute)
+        of_tiles, behind = gradient.index_select(0, front.tiles), rest.index_select(0, front.tiles)
+        part = front_gradient(tables, front, of_tiles, behind, absolute)
         rest.index_copy_(0, front.tiles, part.rest)
         rows.index_copy_(0, front.blocks, part.rows)
         channels.index_copy_(0, front.blocks, part.channels)
@@ -273,7 +270,7 @@ def all_gradients(
 
 
 def sum_by_splat(values: Float[Tensor, "E V"], splats: Int[Tensor, "E"], count: int) -> Float[Tensor, "M V"]:
-    """Sums over the list entries of each splat, always in the same order (as index_add_ is, but on a CPU only)."""
+    """Sums over the list entries of each splat in a fixed order, which index_add_ has on a CPU only."""
     if values.device.type == "cpu":
         return values.new_zeros(count, values.shape[1]).index_add_(0, splats, values)
     order = torch.argsort(splats, stable=True)
@@ -282,7 +279,7 @@ def sum_by_splat(values: Float[Tensor, "E V"], splats: Int[Tensor, "E"], count: 
 
 
 class Composite(torch.autograd.Function):
-    """See `composite` for the arguments."""
+    """Autograd function of `composite`."""
 
     @staticmethod
     def forward(ctx, means, conic_factors, log_opacities, channels, absgrad, blocks, grid, settings, max_weights):
@@ -319,7 +316,7 @@ def composite(
     absgrad: Float[Tensor, "M 2"] | None = None,
     max_weights: Float[Tensor, "S K"] | None = None,
 ) -> Float[Tensor, "C_plus_1 H W"]:
-    """Blended channels, then coverage (the sum of weights), on the raster of `grid`.
+    """Returns blended channels, then coverage (the sum of weights), on the raster of `grid`.
 
     `absgrad` is a leaf of zeros whose gradient becomes, per axis, the sum over pixels of the absolute gradient of the
     mean (px). `max_weights` receives the largest blending weight of each list entry.
@@ -334,7 +331,7 @@ def composite_eager(
     grid: TileGrid,
     settings: RasterSettings,
 ) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
-    """Blends by eager torch; a `Compositor`."""
+    """Blends in eager torch; a `Compositor`."""
     blocks = make_blocks(intersections, settings.chunk, len(screen.ids))
     by_entry = screen.means.new_zeros(blocks.splats.shape) if screen.weigh else None
     inputs = (screen.means, screen.conic_factors, screen.log_opacities, channels)

@@ -1,4 +1,4 @@
-"""What a compositor is: it blends the splats of each tile into a picture. Plugins may add some."""
+"""Compositors: they blend the splats of each tile into a picture. Plugins may add some."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class NoOptions:
-    """Options of a compositor that has none."""
+    """Options of a compositor without options."""
 
 
 @runtime_checkable
 class Compositor(Protocol):
-    """Blends splats front to back; differentiable in the means, factors, opacities and channels."""
+    """Front-to-back blending, differentiable in means, factors, opacities and channels."""
 
     def __call__(
         self,
@@ -33,7 +33,7 @@ class Compositor(Protocol):
         grid: "TileGrid",
         settings: "RasterSettings",
     ) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
-        """Returns blended channels and, last, coverage; and the largest weight of every splat if `screen.weigh`.
+        """Returns blended channels with coverage last, and the largest weight of each splat if `screen.weigh`.
 
         If `screen.absgrad` is not None, its gradient becomes the sum of absolute gradients of the mean, px.
         """
@@ -42,15 +42,15 @@ class Compositor(Protocol):
 
 @runtime_checkable
 class WithBackend(Protocol):
-    """A compositor whose other kernels, and those of the loss, run by a backend of its choice; else by eager torch."""
+    """A compositor with a backend for all other kernels and the loss; the default is eager torch."""
 
     backend: Backend
 
 
 @runtime_checkable
 class Restricted(Protocol):
-    """A compositor that does not run everywhere."""
+    """A compositor that does not work with all settings or devices."""
 
     def refuse(self, settings: "RasterSettings", device: torch.device) -> None:
-        """Raises ConfigError, with a remedy, where it cannot draw by these settings on a device."""
+        """Raises ConfigError, with a remedy, if it does not work with these settings on a device."""
         ...

@@ -1,4 +1,4 @@
-"""ln alpha over the pixels of a tile, with its gradient (docs/explanation/numerics.md).
+"""ln alpha at the pixels of a tile, and its gradient (docs/explanation/numerics.md).
 
 Half the inverse covariance is U^T U with U = [[u0, u1], [0, u2]], so with d = pixel - mean
 
@@ -18,10 +18,7 @@ from gsx.core.shapes import Float
 def exponent_rows(
     offsets: Float[Tensor, "S K 2"], conic_factors: Float[Tensor, "S K 3"], log_opacities: Float[Tensor, "S K"]
 ) -> Float[Tensor, "S K 7"]:
-    """Returns (u0, u1, k0, 0, u2, k1, ln o), where s = u0 x + u1 y + k0 and r = u2 y + k1.
-
-    `offsets`: of the mean from the tile's centre, px.
-    """
+    """Returns (u0, u1, k0, 0, u2, k1, ln o), where s = u0 x + u1 y + k0 and r = u2 y + k1; `offsets`: mean, px."""
     u0, u1, u2 = conic_factors.unbind(-1)
     x, y = offsets.unbind(-1)
     return torch.stack([u0, u1, -(u0 * x + u1 * y), torch.zeros_like(u0), u2, -u2 * y, log_opacities], -1)
@@ -30,7 +27,7 @@ def exponent_rows(
 def log_alphas(
     rows: Float[Tensor, "B K 7"], basis: Float[Tensor, "3 P"]
 ) -> tuple[Float[Tensor, "B K P"], tuple[Tensor, Tensor]]:
-    """Returns ln alpha in the dtype of `basis`, which is (x, y, 1) at the pixels; and (s, r) for the gradients."""
+    """Returns ln alpha in the dtype of `basis`, (x, y, 1) at the pixels, and (s, r) for the gradients."""
     rows = rows.to(basis.dtype)
     flat = rows.view(-1, 7)
     shape = (*rows.shape[:2], basis.shape[1])

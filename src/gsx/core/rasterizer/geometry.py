@@ -1,7 +1,6 @@
-"""Differentiable mathematics of the projection, eager or compiled (docs/explanation/numerics.md; 3D-GS section 3.2).
+"""Differentiable projection kernel, eager or compiled (docs/explanation/numerics.md; 3D-GS section 3.2).
 
-Vectors are tuples of columns, one tensor of [M] per component: on a CPU a third of the time of the same formulas on
-rows of three, whose inner loops of length three leave vector units idle.
+Vectors are tuples of columns, one tensor [M] per component: on a CPU three times as fast as rows of three.
 """
 
 from functools import reduce
@@ -15,34 +14,34 @@ from torch.nn.functional import logsigmoid
 from gsx.core.shapes import Float
 
 Columns: TypeAlias = tuple[Tensor, ...]
-"""The components of M vectors, each [M], or [] when all vectors share it."""
+"""Components of M vectors, each [M], or [] if shared by all."""
 LEAST_SHARE = 1e-30
 """Floor of |S| / (|S + d I| - |S|) in the compensation: an opacity of 1 becomes 1e-15, which is not drawn."""
 
 
 def dot(a: Columns, b: Columns) -> Tensor:
-    """a . b, [M]."""
+    """Returns a . b, [M]."""
     return reduce(add, (x * y for x, y in zip(a, b, strict=True)))
 
 
 def cross(a: Columns, b: Columns) -> Columns:
-    """a x b."""
+    """Returns a x b."""
     (ax, ay, az), (bx, by, bz) = a, b
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
 def plus(a: Columns, factor: Tensor | float, b: Columns) -> Columns:
-    """a + factor b."""
+    """Returns a + factor b."""
     return tuple(x + factor * y for x, y in zip(a, b, strict=True))
 
 
 def scaled(a: Columns, factors: Columns) -> Columns:
-    """Component by component."""
+    """Returns the products of the components."""
     return tuple(x * factor for x, factor in zip(a, factors, strict=True))
 
 
 def unit(quats: Float[Tensor, "M 4"]) -> Columns:
-    """q / max(|q|, 1e-12)."""
+    """Returns q / max(|q|, 1e-12)."""
     # the largest part first: the square of a long quaternion would overflow
     largest = quats.detach().abs().amax(1).clamp_min(1e-12)
     parts = tuple(part / largest for part in quats.unbind(1))
@@ -51,7 +50,7 @@ def unit(quats: Float[Tensor, "M 4"]) -> Columns:
 
 
 def rotate_back(quat: Columns, vector: Columns) -> Columns:
-    """R(q)^T v for unit quaternions (w, x, y, z); a zero quaternion is the identity."""
+    """Returns R(q)^T v for unit quaternions (w, x, y, z); the zero quaternion is the identity."""
     w, *axis = quat
     half = cross(tuple(axis), vector)
     return plus(plus(vector, -2 * w, half), 2, cross(tuple(axis), half))
@@ -60,7 +59,7 @@ def rotate_back(quat: Columns, vector: Columns) -> Columns:
 def screen_axes(
     slopes: Columns, stretches: Columns, sizes: Columns, quats: Columns, rotation: Float[Tensor, "3 3"]
 ) -> tuple[Columns, Columns]:
-    """The rows p, q of J W R diag(s), px. `slopes` are x/z and y/z, `sizes` the scales in px at the splat's depth."""
+    """Returns the rows p, q of J W R diag(s), px; `slopes`: x/z and y/z, `sizes`: scales in px at the splat's depth."""
     right, down, forward = (row.unbind() for row in rotation)
     p, q = (
         scaled(rotate_back(quats, tuple(stretch * part for part in plus(row, -slope, forward))), sizes)
@@ -70,10 +69,10 @@ def screen_axes(
 
 
 def covariance_and_factor(p: Columns, q: Columns, dilation: Float[Tensor, "1"]) -> tuple[Columns, Columns, Columns]:
-    """Dilated covariance (xx, xy, yy) = P P^T + d I and its factor U, where p, q are the rows of P.
+    """Returns the dilated covariance (xx, xy, yy) = P P^T + d I, its factor U, and two parts of determinant / yy.
 
-    Its determinant is |p x q|^2 + d (|p|^2 + |q|^2) + d^2 by Lagrange's identity: no cancellation, never negative.
-    Third are its two parts over yy: the determinant before dilation, and what dilation adds.
+    p, q are the rows of P. The determinant is |p x q|^2 + d (|p|^2 + |q|^2) + d^2 by Lagrange's identity, without
+    cancellation. The parts are the determinant before dilation, and the part from dilation.
     """
     pp, pq, qq = dot(p, p), dot(p, q), dot(q, q)
     xx, yy = pp + dilation, qq + dilation
@@ -84,7 +83,7 @@ def covariance_and_factor(p: Columns, q: Columns, dilation: Float[Tensor, "1"]) 
 
 
 def log_compensation(bare: Float[Tensor, "M"], added: Float[Tensor, "M"]) -> Float[Tensor, "M"]:
-    """ln sqrt(|S| / |S + d I|) of determinants |S| = bare and |S + d I| = bare + added (Mip-Splatting, forward.cu).
+    """Returns ln sqrt(|S| / |S + d I|) for |S| = bare and |S + d I| = bare + added (Mip-Splatting, forward.cu).
 
     The ratio is the sigmoid of ln(bare / added): exact near 0 and near 1; constant below the floor.
     """
@@ -99,9 +98,9 @@ def log_exchange(
     yy: Float[Tensor, "M"],
     drawn: Float[Tensor, "1"],
 ) -> Float[Tensor, "M"]:
-    """ln sqrt(|S + drawn I| / |S + d I|): what keeps the mass of a splat whose dilation becomes d instead of `drawn`.
+    """Returns ln sqrt(|S + drawn I| / |S + d I|), which keeps a splat's mass if its dilation is d, not `drawn`.
 
-    `bare`, `added` and yy as `covariance_and_factor` has them for d.
+    `bare`, `added` and yy are those of `covariance_and_factor` for d.
     """
     before = bare + drawn * ((dot(p, p) + dot(q, q) + drawn) / yy)
     return (before.log() - (bare + added).log()) / 2
@@ -119,12 +118,19 @@ def geometry(
     compensate: bool,
     drawn: Float[Tensor, "1"] | None = None,
 ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M"] | None]:
-    """Screen means (px of the frame), dilated covariances and factors of splats at `points` of the camera's frame.
+    """Returns screen means (px of the frame), dilated covariances, their factors, and ln of the opacity factor or None.
 
-    Fourth is the ln of the factor on opacities that makes up for dilation, all of it (`compensate`) or as far as it
-    differs from `drawn`; None unless asked for.
-    `dilation` and `drawn` are px^2; `points` and `intrinsics` (fx, fy, cx, cy) are float64; `low` and `high` bound the
-    slopes x/z, y/z in the Jacobian.
+    Args:
+        points: Means in camera coordinates, float64.
+        scales: Standard deviations, world units.
+        quats: Rotations (w, x, y, z) of any length.
+        rotation: Camera from world.
+        intrinsics: (fx, fy, cx, cy) on the frame, float64.
+        low: Lower bounds of x/z and y/z in the Jacobian.
+        high: Upper bounds.
+        dilation: px^2.
+        compensate: True: the opacity factor compensates the whole dilation.
+        drawn: Dilation that opacities are trained for, px^2: the factor compensates the difference; None: no factor.
     """
     x, y, z = points.unbind(1)
     fx, fy, cx, cy = intrinsics

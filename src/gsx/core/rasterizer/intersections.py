@@ -1,12 +1,11 @@
-"""Which splats reach which tiles, front to back. Nothing here is differentiated.
+"""Intersections of splats and tiles, front to back. Nothing here is differentiated.
 
-A splat is cut into its rows of tiles; on each row the ellipse alpha >= alpha_min spans an exact interval of columns, so
-no candidate is made that is no intersection. Screen splats come nearest first, hence so do their intersections, and one
-stable sort by tile keeps them so.
+On each row of tiles the ellipse alpha >= alpha_min of a splat spans an exact interval of columns. Splats are taken
+nearest first, and a stable sort by tile keeps that order.
 """
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -24,57 +23,51 @@ from gsx.core.rasterizer.sorting import sorted_stably
 from gsx.core.shapes import Float, Int
 
 WINDOW_REACH = 1.25
-"""Px from its centre within which all light of a pixel lies where windows are kept: half a diagonal, and as much as a
-window grows where a needle leaves light at both of its sides."""
+"""Reach of a pixel's window from its centre, px: half a diagonal, and the growth of a window cut by a needle."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TileIntersections:
-    """P intersections of splats and tiles, sorted by tile, within a tile by depth."""
+    """P intersections of splats and tiles, sorted by tile, then by depth."""
 
     splats: Int[Tensor, "P"]
     """Row of the screen splat."""
     tiles: Int[Tensor, "P"]
-    """Tile, row-major over the grid."""
+    """Tile, row-major on the grid."""
     starts: Int[Tensor, "T_plus_1"]
     """First intersection of each tile, then P."""
     slots: Int[Tensor, "P"]
-    """Place of each in the list sorted by splat, nearest splat first: a permutation."""
+    """Index of each in the list sorted by splat, nearest first: a permutation."""
     order: Int[Tensor, "M"]
     """Rows of the screen splats, nearest first."""
     counts: Int[Tensor, "M"]
-    """How many each of them has."""
+    """Number of intersections of each of them."""
     radii: Int[Tensor, "M"]
-    """Published radius in px, ceil(3 sqrt(largest eigenvalue)); 0 where the splat touches no tile."""
+    """Published radius ceil(3 sqrt(largest eigenvalue)), px; 0: the splat touches no tile."""
 
 
 def reach_of(settings: RasterSettings) -> float:
-    """How far from a pixel's centre a splat still matters to it, px."""
+    """Returns the largest distance from a pixel's centre at which a splat affects it, px."""
     return WINDOW_REACH if settings.pixel == "window" else 0.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Boxes:
-    """Tiles (counted on the frame) that M splats may reach, and their published radii."""
+    """Bounding boxes of M splats in tiles of the frame, and their published radii."""
 
     first: Int[Tensor, "2 M"]
     """First column, first row."""
     last: Int[Tensor, "2 M"]
-    """One past the last."""
+    """One past the last column and row."""
     radii: Int[Tensor, "M"]
-    """px; 0 where no tile of the published square touches the raster."""
+    """Published radius, px; 0: no tile of the published square touches the raster."""
     limits: Float[Tensor, "M"]
-    """Largest s^2 + r^2 at which alpha is still at least alpha_min; negative: nowhere."""
-
-
-def raster_numbers(camera: Camera, settings: RasterSettings, device: torch.device) -> Int[Tensor, "2 5"]:
-    """What `boxes` wants to know of a raster."""
-    return uploaded_numbers(camera.frame, camera.size, TileGrid.of(camera, settings.tile_size), device)
+    """Largest s^2 + r^2 with alpha >= alpha_min; negative: nowhere."""
 
 
 @functools.lru_cache(maxsize=64)
-def uploaded_numbers(frame: Frame, size: tuple[int, int], grid: TileGrid, device: torch.device) -> Int[Tensor, "2 5"]:
-    """`raster_numbers`, of which the same are wanted again and again."""
+def raster_numbers(frame: Frame, size: tuple[int, int], grid: TileGrid, device: torch.device) -> Int[Tensor, "2 5"]:
+    """Returns the numbers of a raster for `boxes`, on the device."""
     sides = zip((frame.width, frame.height), (frame.left, frame.top), size, grid.first, grid.shape, strict=True)
     numbers = [
         [-(-whole // WINDOW_TILE), at, at + extent, begin, begin + count] for whole, at, extent, begin, count in sides
@@ -84,26 +77,27 @@ def uploaded_numbers(frame: Frame, size: tuple[int, int], grid: TileGrid, device
 
 @torch.no_grad()
 def boxes_of(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> Boxes:
-    """Boxes of splats on the screen."""
+    """Returns the bounding boxes of splats on the screen."""
     rules = (
         settings.alpha_min,
         settings.tile_size,
         reach_of(settings),
         settings.cull == "published" and settings.pixel == "sample",
     )
-    numbers = raster_numbers(camera, settings, screen.means.device)
-    given = screen.means.detach(), screen.covariances.detach(), screen.log_opacities.detach(), numbers
-    backend = settings.backend.on(screen.means.device.type) if len(screen.ids) > 1 else EAGER
-    *edges, radii, limits = backend.kernel(boxes, *rules)(*given)
+    device = screen.means.device
+    numbers = raster_numbers(camera.frame, camera.size, TileGrid.of(camera, settings.tile_size), device)
+    shapes = screen.means.detach(), screen.covariances.detach(), screen.log_opacities.detach()
+    backend = settings.backend.on(device.type) if len(screen.ids) > 1 else EAGER
+    *edges, radii, limits = backend.kernel(boxes, *rules)(*shapes, numbers)
     return Boxes(first=torch.stack(edges[:2]), last=torch.stack(edges[2:]), radii=radii, limits=limits)
 
 
 @torch.no_grad()
 def intersect_tiles(screen: ScreenSplats, camera: Camera, settings: RasterSettings) -> TileIntersections:
-    """Of every splat with every tile where its alpha may reach alpha_min.
+    """Returns the intersections of each splat with all tiles where its alpha may reach alpha_min.
 
     Raises:
-        TooManyPairs: more than `settings.max_pairs` pairs would be needed.
+        TooManyPairs: there are more than `settings.max_pairs`.
     """
     grid, found = TileGrid.of(camera, settings.tile_size), boxes_of(screen, camera, settings)
     # positive floats sort like the integers of their bits, which torch sorts faster; ties stay in their order
@@ -112,7 +106,7 @@ def intersect_tiles(screen: ScreenSplats, camera: Camera, settings: RasterSettin
     shapes = screen.means.detach(), screen.conic_factors.detach(), found.limits
     backend = settings.backend.on(order.device.type)
     heights, placed, sides = backend.kernel(in_order)(order, found.first, found.last, *shapes)
-    starts = heights.cumsum(0) - heights  # apart: compiled, a long running sum is one of a single group of threads
+    starts = heights.cumsum(0) - heights  # not compiled: a long running sum would use one group of threads
     rank = torch.repeat_interleave(heights, output_size=refuse_too_many(heights, grid, settings))
     find_spans = (backend if min(len(rank), len(order)) > 1 else EAGER).kernel(spans, grid.tile, reach_of(settings))
     row, begin, widths = find_spans(rank, placed, sides, starts)
@@ -130,8 +124,7 @@ def in_order(
     conic_factors: Float[Tensor, "M 3"],
     limits: Float[Tensor, "M"],
 ) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 6"], Int[Tensor, "M 3"]]:
-    """(rows of tiles of every splat, and its shape and sides as `spans` wants them), nearest splats first; none where a
-    box has no columns."""
+    """Returns each splat's number of tile rows, and shapes and sides for `spans`, nearest splats first."""
     heights = (last[1] - first[1]).clamp_min(0) * (last[0] > first[0])
     shapes = torch.cat([means, conic_factors, limits[:, None]], 1)
     sides = torch.stack([first[1], first[0], last[0]], 1)
@@ -141,8 +134,7 @@ def in_order(
 def pair_tiles(
     line: Int[Tensor, "P"], row: Int[Tensor, "R"], begin: Int[Tensor, "R"], before: Int[Tensor, "R"], columns: int
 ) -> Int[Tensor, "P"]:
-    """Tile of every pair, where pairs of a span follow each other from its column `begin` on, the first of them pair
-    `before`."""
+    """Returns the tile of each pair; pairs of a span start at its column `begin` with index `before`."""
     place = torch.arange(line.shape[0], device=line.device, dtype=torch.int32)
     return place + (row * columns + begin - before).index_select(0, line)
 
@@ -156,8 +148,17 @@ def sorted_pairs(
     grid: TileGrid,
     radii: Int[Tensor, "M"],
 ) -> TileIntersections:
-    """Sorts intersections by tile; `rank` names the splat of each span of `widths` tiles, `line` the span of each
-    intersection, `tiles` its tile."""
+    """Sorts intersections by tile.
+
+    Args:
+        order: Splats, nearest first.
+        rank: Index into `order` of each span of `widths` tiles.
+        widths: Number of tiles of each span.
+        line: Span of each intersection.
+        tiles: Tile of each intersection.
+        grid: Grid of the tiles.
+        radii: Published radii.
+    """
     columns, rows = grid.shape
     narrow = torch.int16 if columns * rows <= torch.iinfo(torch.int16).max else torch.int32  # sorted fastest
     tiles, slots = sorted_stably(tiles.to(narrow))
@@ -178,14 +179,13 @@ def sorted_pairs(
 def sum_by_splat(
     values: Float[Tensor, "E V"], intersections: TileIntersections, places: Int[Tensor, "P"], count: int
 ) -> Float[Tensor, "count V"]:
-    """Sums over the entries of each splat, always in the same order; `places`: entry of each pair, pairs sorted by
-    splat."""
+    """Sums over the entries of each splat in a fixed order; `places`: entry of each pair, pairs sorted by splat."""
     sums = bag_sums(values, places, edges_of(intersections.counts))
     return values.new_zeros(count, values.shape[1]).index_copy_(0, intersections.order, sums)
 
 
 def refuse_too_many(counts: Int[Tensor, "N"], grid: TileGrid, settings: RasterSettings) -> int:
-    """Their sum; raises TooManyPairs before memory for too many pairs is asked for."""
+    """Returns their sum; TooManyPairs: it exceeds `max_pairs`."""
     count = int(counts.sum())
     if count > settings.max_pairs:
         raise TooManyPairs(
@@ -193,3 +193,25 @@ def refuse_too_many(counts: Int[Tensor, "N"], grid: TileGrid, settings: RasterSe
             f"rasterizer.max_pairs={settings.max_pairs:,}: render it in smaller pieces or raise the limit"
         )
     return count
+
+
+def capped(every: TileIntersections, cap: int) -> TileIntersections:
+    """Keeps the first `cap` intersections of each tile, its nearest splats; 0: all.
+
+    Radii are kept: a splat without tiles still counts as visible, as behind opaque ones.
+    """
+    if not cap or not len(every.tiles):
+        return every
+    number = torch.arange(len(every.tiles), device=every.tiles.device) - every.starts[every.tiles.long()]
+    kept = number < cap
+    lengths = every.starts.diff().clamp(max=cap)
+    kept_by_splat = torch.empty_like(kept).index_put_((every.slots,), kept)
+    owner = torch.repeat_interleave(every.counts)
+    return replace(
+        every,
+        splats=every.splats[kept],
+        tiles=every.tiles[kept],
+        starts=torch.cat([every.starts[:1], lengths.cumsum(0).to(every.starts)]),
+        slots=(kept_by_splat.cumsum(0) - 1)[every.slots[kept]],
+        counts=torch.bincount(owner[kept_by_splat], minlength=len(every.counts)),
+    )

@@ -1,4 +1,4 @@
-"""Stable projection of world Gaussians to the screen (docs/explanation/numerics.md; 3D-GS sections 3.1 and 3.2)."""
+"""Projection of Gaussians to the screen (docs/explanation/numerics.md; 3D-GS sections 3.1 and 3.2)."""
 
 import math
 from dataclasses import dataclass
@@ -19,15 +19,15 @@ from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
 
 FOCAL_LIMIT = 1e12
-"""No camera has a focal length of so many px, or sees so many focal lengths off its axis."""
+"""Bound of focal lengths, px, and of slopes x/z and y/z."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScreenSplats:
-    """M splats that the camera may show. Positions in pixels of the camera's frame, pixel centres at +0.5."""
+    """M splats near the raster; positions in px of the camera's frame, pixel centres at +0.5."""
 
     ids: Int[Tensor, "M"]
-    """Row of the splat in the input."""
+    """Row of each splat in the input."""
     means: Float[Tensor, "M 2"]
     depths: Float[Tensor, "M"]
     """Camera z, scene units."""
@@ -36,41 +36,36 @@ class ScreenSplats:
     conic_factors: Float[Tensor, "M 3"]
     """(u0, u1, u2): half the inverse covariance is U^T U with U = [[u0, u1], [0, u2]]."""
     log_opacities: Float[Tensor, "M"]
-    """Compensated for dilation where the settings ask for it."""
+    """ln of the opacity, compensated for dilation by the settings."""
     channels: Float[Tensor, "M C"]
     absgrad: Float[Tensor, "M 2"] | None = None
     """Zeros whose gradient becomes, per axis, the sum over pixels of the absolute gradient of the mean, px."""
     weigh: bool = False
-    """Whether the compositor is to return the largest blending weight of every splat."""
+    """True: the compositor returns each splat's largest blending weight."""
     dropped: int
-    """Splats left out because a value or a projection of theirs is not finite, or its square is not."""
+    """Number of splats left out because a value, its projection or its square is not finite."""
 
 
 def intrinsics_of(camera: Camera, intrinsics: Float[Tensor, "4"] | None) -> Float[Tensor, "4"]:
-    """(fx, fy, cx, cy) of the camera's raster in float64, `intrinsics` where they are given."""
+    """Returns `intrinsics`, or the camera's (fx, fy, cx, cy), in float64."""
     if intrinsics is None:
         return torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
     return intrinsics.double()
 
 
 def on_frame(intrinsics: Float[Tensor, "4"], frame: Frame) -> Float[Tensor, "4"]:
-    """Intrinsics with the principal point counted on the frame."""
+    """Returns intrinsics with the principal point on the frame."""
     return intrinsics + intrinsics.new_tensor([0, 0, frame.left, frame.top])
 
 
-@torch.no_grad()
-def steepest_slope(intrinsics: Float[Tensor, "4"], frame: Frame, margin: float) -> Float[Tensor, ""]:
-    """Largest |x/z| or |y/z| within the bounds."""
-    return torch.cat(slope_bounds(intrinsics, frame, margin)).abs().amax()
-
-
 def refuse_unusable(camera: Camera, intrinsics: Float[Tensor, "4"], margin: float) -> None:
-    """Raise InputError for a camera through which nothing can be projected."""
+    """Raises InputError for a camera that cannot project."""
     fx, fy, cx, cy = intrinsics.tolist()
     words = f"fx={fx}, fy={fy}, cx={cx}, cy={cy}, near={camera.near}"
     if not (0 < fx < FOCAL_LIMIT and 0 < fy < FOCAL_LIMIT and 0 <= camera.near < math.inf):
-        raise InputError(f"a camera has {words}: focal lengths must be in (0, {FOCAL_LIMIT:g}) px, near at least 0")
-    if not float(steepest_slope(on_frame(intrinsics, camera.frame), camera.frame, margin)) < FOCAL_LIMIT:
+        raise InputError(f"a camera has {words}: give focal lengths in (0, {FOCAL_LIMIT:g}) px, near at least 0")
+    slopes = torch.cat(slope_bounds(on_frame(intrinsics.detach(), camera.frame), camera.frame, margin))
+    if not float(slopes.abs().amax()) < FOCAL_LIMIT:
         raise InputError(
             f"a camera has {words} and sees {FOCAL_LIMIT:g} focal lengths off its axis: check its intrinsics"
         )
@@ -81,7 +76,7 @@ def refuse_unusable(camera: Camera, intrinsics: Float[Tensor, "4"], margin: floa
 
 @torch.no_grad()
 def drawable(splats: Splats, camera: Camera, settings: RasterSettings) -> Bool[Tensor, "N"]:
-    """False for the splats that a render from this camera leaves out and counts as dropped."""
+    """Marks all splats except those that a render from this camera drops because of their values."""
     numbers = lens_of(camera, on_frame(intrinsics_of(camera, None), camera.frame), settings.dilation, settings)
     numbers = numbers.to(splats.means.device)
     return selected(splats, camera.to_camera(splats.means), numbers, EAGER)[0]
@@ -90,12 +85,12 @@ def drawable(splats: Splats, camera: Camera, settings: RasterSettings) -> Bool[T
 def project(
     splats: Splats, camera: Camera, settings: RasterSettings, intrinsics: Float[Tensor, "4"] | None = None
 ) -> ScreenSplats:
-    """The usable splats in front of the near plane that the camera may show; differentiable in every input.
+    """Projects the usable splats beyond the near plane and near the raster; differentiable in every input.
 
-    `intrinsics` (fx, fy, cx, cy) take the place of the camera's, in px of its raster.
+    `intrinsics` (fx, fy, cx, cy) replace the camera's, px of its raster.
 
     Raises:
-        InputError: no picture can be taken with the camera's numbers.
+        InputError: the camera cannot project.
     """
     own = intrinsics_of(camera, intrinsics)
     refuse_unusable(camera, own, settings.jacobian_margin)
@@ -104,13 +99,12 @@ def project(
     numbers = uploaded(lens, splats.means.device)
     points = camera.to_camera(splats.means)
     device = splats.means.device.type
-    good, shown = selected(splats, points, numbers, settings.backend.on(device) if len(splats) > 1 else EAGER)
+    good, visible = selected(splats, points, numbers, settings.backend.on(device) if len(splats) > 1 else EAGER)
     fields = (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
-    ids, dropped = chosen_rows(good, shown)  # before any division
+    ids, dropped = chosen_rows(good, visible)  # before any division
     points, scales, quats, log_opacities, channels = (take_rows(values, ids) for values in fields)
     compensate = settings.compensate and settings.published_dilation
-    # tensors of one element: a number would be a constant, so that each dilation would compile anew, and so would, to
-    # torch, a float64 tensor of no dimension
+    # tensors of one element: torch would compile anew for each number, and for each 0-dimensional float64 tensor
     rules = scales.new_full((1,), dilation), compensate, scales.new_full((1,), drawn) if drawn else None
     shape = numbers[:4], numbers[4:6].to(scales), numbers[6:8].to(scales)
     backend = settings.backend.on(device, learning=True) if len(ids) > 1 else EAGER
@@ -118,7 +112,7 @@ def project(
     means, covariances, conic_factors, compensation = compute(
         points, scales, quats, uploaded(camera.rotation, ids.device, scales.dtype), *shape, *rules
     )
-    if drawn and compensation is not None:  # nothing becomes more opaque than alpha_max by it
+    if drawn and compensation is not None:  # opacities stay at most alpha_max
         most = log_opacities.clamp_min(math.log(settings.alpha_max))
         compensation = torch.minimum(compensation, most - log_opacities)
     return ScreenSplats(
@@ -136,21 +130,21 @@ def project(
 def dilations_of(
     camera: Camera, intrinsics: Float[Tensor, "4"] | None, settings: RasterSettings
 ) -> tuple[float, float]:
-    """(dilation, the dilation that opacities are compensated from or 0), px^2; by `intrinsics` where they are given."""
+    """Returns `RasterSettings.dilation_at` the focal length of `intrinsics` or the camera."""
     if settings.published_dilation:
         return settings.dilation, 0.0
     return settings.dilation_at(camera.focal if intrinsics is None else float(intrinsics[:2].max().detach()))
 
 
 def select_rows(ctx: Any, values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[Tensor, "M *rest"]:
-    """Forward: rows, and what their gradients are put together by."""
+    """Selects rows, and saves the ids for the backward pass."""
     ctx.save_for_backward(ids)
     ctx.shape = values.shape
     return values.index_select(0, ids)
 
 
 class TakeRows(torch.autograd.Function):
-    """Selects distinct rows; their gradients are copied back, where indexing would have to add."""
+    """Autograd function of distinct rows; the backward pass copies, where indexing adds."""
 
     forward = staticmethod(select_rows)
 
@@ -161,13 +155,12 @@ class TakeRows(torch.autograd.Function):
 
 
 def take_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[Tensor, "M *rest"]:
-    """`values[ids]` for ids that are all different."""
+    """Returns `values[ids]` for distinct ids."""
     return TakeRows.apply(values, ids)
 
 
 class RepeatRows(torch.autograd.Function):
-    """Selects rows by ascending ids, some of them several times; their gradients are added in the order of the list.
-    torch's own selection adds them in any order on a GPU."""
+    """Autograd function of rows by ascending ids; the backward pass adds in a fixed order, also on a GPU."""
 
     forward = staticmethod(select_rows)
 
@@ -180,5 +173,5 @@ class RepeatRows(torch.autograd.Function):
 
 
 def repeat_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[Tensor, "M *rest"]:
-    """`values[ids]` for ids that ascend, with repetitions."""
+    """Returns `values[ids]` for ascending ids with repetitions."""
     return RepeatRows.apply(values, ids)

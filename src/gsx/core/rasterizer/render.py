@@ -1,4 +1,4 @@
-"""`rasterize`: splats and a camera in, a `Rendering` out."""
+"""Rendering of splats by a camera: `rasterize`."""
 
 from dataclasses import dataclass, replace
 
@@ -7,10 +7,9 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer.cap import capped
 from gsx.core.rasterizer.composite import composite_eager
 from gsx.core.rasterizer.grid import TileGrid
-from gsx.core.rasterizer.intersections import intersect_tiles
+from gsx.core.rasterizer.intersections import capped, intersect_tiles
 from gsx.core.rasterizer.projection import ScreenSplats, project
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
@@ -18,18 +17,18 @@ from gsx.core.shapes import Bool, Float, Int
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScreenStatistics:
-    """What happened to the M splats that the camera may show; gradients are there after the backward pass."""
+    """Screen values of M splats near the raster; their gradients exist after the backward pass."""
 
     ids: Int[Tensor, "M"]
-    """Row of the splat in the input."""
+    """Row of each splat in the input."""
     radii: Int[Tensor, "M"]
     """Published radius, px; 0: touches no tile."""
     means2d_offset: Float[Tensor, "M 2"]
-    """Zeros added to the screen means; their gradient is that of the means, px, blending path only (3D-GS)."""
+    """Zeros added to the screen means; their gradient is that of the means by blending, px (3D-GS)."""
     absgrad: Float[Tensor, "M 2"] | None
-    """Its gradient is the sum over pixels of absolute gradients, px; None unless asked for."""
+    """Zeros whose gradient is the sum over pixels of absolute gradients, px; None: not computed."""
     max_weights: Float[Tensor, "M"] | None
-    """Largest blending weight over all pixels; None unless asked for."""
+    """Largest blending weight over all pixels; None: not computed."""
     size: tuple[int, int]
     """(width, height) of the raster."""
 
@@ -37,7 +36,7 @@ class ScreenStatistics:
     def before_blending(
         screen: ScreenSplats, radii: Int[Tensor, "M"], size: tuple[int, int], learning: bool, absolute: bool
     ) -> "ScreenStatistics":
-        """Of splats on the screen, with zeros that are to gather gradients."""
+        """Returns the statistics before blending, with zeros for gradients."""
         zeros = [torch.zeros_like(screen.means, requires_grad=learning) for _ in range(1 + absolute)]
         return ScreenStatistics(
             ids=screen.ids,
@@ -50,30 +49,30 @@ class ScreenStatistics:
 
     @property
     def visible(self) -> Bool[Tensor, "M"]:
-        """Splats that touch a tile; no pixel need have been shaded (3D-GS, forward.cu)."""
+        """Splats that touch a tile, whether or not a pixel is shaded (3D-GS, forward.cu)."""
         return self.radii > 0
 
     def ndc_gradient(self, of: Tensor) -> Float[Tensor, "M 2"]:
-        """Gradient of `means2d_offset` or `absgrad` in NDC units: pixels times half the raster (3D-GS, backward.cu)."""
+        """Returns the gradient of `means2d_offset` or `absgrad` in NDC, px times half the raster (3D-GS)."""
         gradient = of.grad if of.grad is not None else torch.zeros_like(of)
         return torch.stack([along * side / 2 for along, side in zip(gradient.unbind(1), self.size, strict=True)], 1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Rendering:
-    """A picture and what went into it."""
+    """A rendered picture with screen statistics."""
 
     image: Float[Tensor, "C H W"]
     """Blended colours over the background; not clamped."""
     alpha: Float[Tensor, "H W"]
     """Coverage in [0, 1]."""
     depth: Float[Tensor, "H W"] | None
-    """Blending-weighted sum of camera z, scene units (divide by alpha for a mean); None unless asked for."""
+    """Blending-weighted sum of camera z, scene units (divide by alpha for a mean); None: not computed."""
     screen: ScreenStatistics
     intersections: int
-    """Splat-tile pairs blended."""
+    """Number of blended splat-tile pairs."""
     dropped: int
-    """Splats left out because a value of theirs is not finite."""
+    """Number of splats left out because of values that are not finite."""
 
 
 def rasterize(
@@ -87,14 +86,21 @@ def rasterize(
     absolute_gradient: bool = False,
     max_weight: bool = False,
 ) -> Rendering:
-    """Render `splats` from `camera`; differentiable in every field of the splats and in the background.
+    """Renders splats; differentiable in their fields, the background, intrinsics, and the camera's pose.
 
-    It is differentiable in the camera's rotation (as nine free numbers) and translation as well, and in `intrinsics`:
-    (fx, fy, cx, cy) in px of the camera's raster, which then take the place of the camera's own.
+    Args:
+        splats: N splats.
+        camera: Camera; its rotation is differentiable as nine free numbers.
+        settings: Rules of the rasterizer.
+        background: Colour behind the splats; None: black.
+        intrinsics: (fx, fy, cx, cy) in px that replace the camera's.
+        depth: True: renders depth.
+        absolute_gradient: True: collects absolute gradients (`ScreenStatistics.absgrad`).
+        max_weight: True: returns largest blending weights (`ScreenStatistics.max_weights`).
 
     Raises:
-        InputError: the camera's numbers allow no picture.
-        TooManyPairs: the picture needs more splat-tile pairs than `settings.max_pairs`.
+        InputError: the camera cannot project.
+        TooManyPairs: there are more splat-tile pairs than `settings.max_pairs`.
     """
     screen = project(splats, camera, settings, intrinsics)
     intersections = capped(intersect_tiles(screen, camera, settings), settings.tile_cap)

@@ -1,4 +1,4 @@
-"""Which splats can be drawn, and which of them a camera may show; found before anything is computed of them."""
+"""Selection of splats with usable values, and of those near a camera's raster, before the projection."""
 
 import functools
 import math
@@ -15,22 +15,22 @@ from gsx.core.rasterizer.settings import CUTOFF_SLACK, WINDOW_TILE, RasterSettin
 from gsx.core.shapes import Bool, Float, Int
 
 OPACITY_SLACK = 1e-3
-"""ln of an opacity may exceed 0 by this, for rounding."""
+"""Tolerance of rounding for ln of an opacity above 0."""
 SQUARABLE = 0.4
-"""Lengths in px stay below this power of their dtype's largest number: 3e15 in float32."""
+"""Exponent of the bound of lengths in px: largest number of the dtype ^ 0.4, 3e15 in float32."""
 LEAST_SPREAD = 0.32
-"""px^2 that the published radius has at least between the axes of a covariance (3D-GS, forward.cu: root of 0.1)."""
+"""Floor of the published radius between the axes of a covariance, px^2 (3D-GS, forward.cu: root of 0.1)."""
 
 
 class Lens(NamedTuple):
-    """What the selection needs to know of a camera, each a number in float64; lengths in px of the frame."""
+    """Numbers of a camera for the selection, float64; lengths in px of the frame."""
 
     fx: Tensor
     fy: Tensor
     cx: Tensor
     cy: Tensor
     lowest_x: Tensor
-    """Slopes x/z, y/z are clamped here in the Jacobian."""
+    """Bounds of x/z and y/z in the Jacobian."""
     lowest_y: Tensor
     highest_x: Tensor
     highest_y: Tensor
@@ -39,20 +39,20 @@ class Lens(NamedTuple):
     dilation: Tensor
     """px^2."""
     left: Tensor
-    """Edges of the raster, with a tile around it."""
+    """Edges of the raster with one tile around it."""
     right: Tensor
     top: Tensor
     bottom: Tensor
     deviations: Tensor
-    """How many standard deviations away a splat still counts."""
+    """Reach of a splat, standard deviations."""
     stretch: Tensor
-    """By how much the rotation lengthens vectors: 1 but for matrices that are none."""
+    """Largest singular value of the rotation: 1, or more for other matrices."""
 
 
 def slope_bounds(
     intrinsics: Float[Tensor, "4"], frame: Frame, margin: float
 ) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
-    """Smallest and largest (x/z, y/z) over the frame widened by `margin` half-extents: asymmetric off centre."""
+    """Returns the smallest and largest (x/z, y/z) over the frame, widened by `margin` half-extents."""
     focal, centre = intrinsics[:2], intrinsics[2:]
     size = intrinsics.new_tensor([frame.width, frame.height])
     extra = margin * size / (2 * focal)
@@ -62,7 +62,7 @@ def slope_bounds(
 def lens_of(
     camera: Camera, intrinsics: Float[Tensor, "4"], dilation: float, settings: RasterSettings
 ) -> Float[Tensor, "16"]:
-    """The numbers of a `Lens`; `intrinsics` count on the frame. Slopes' bounds are differentiable in these."""
+    """Returns the numbers of a `Lens`, differentiable in `intrinsics`, which are on the frame."""
     frame, around = camera.frame, max(WINDOW_TILE, settings.tile_size)
     edges = (
         *(frame.left - around, frame.left + camera.width + around),
@@ -81,13 +81,13 @@ def usable(
     log_opacities: Float[Tensor, "N"],
     colours: Float[Tensor, "N C"],
 ) -> Bool[Tensor, "N"]:
-    """False for splats with a value that is not finite (an opacity of 0, ln -inf, is fine) or an opacity above 1."""
+    """Marks splats with finite values and an opacity of at most 1; ln 0 = -inf is valid."""
     columns = (column for values in (means, scales, quats, colours) for column in values.unbind(1))
     return torch.isfinite(functools.reduce(operator.add, columns)) & (log_opacities <= OPACITY_SLACK)
 
 
 def in_range(points: Float[Tensor, "N 3"], largest_scales: Float[Tensor, "N"], lens: Lens) -> Bool[Tensor, "N"]:
-    """Splats before the camera whose mean and axes in px can be squared in their dtype, as can 1 / depth."""
+    """Marks splats before the camera whose mean, axes in px and 1 / depth can be squared in their dtype."""
     largest = torch.finfo(largest_scales.dtype).max
     x, y, z = points.abs().unbind(1)
     steepest = functools.reduce(torch.maximum, (slope.abs() for slope in lens[4:8]))
@@ -97,10 +97,9 @@ def in_range(points: Float[Tensor, "N 3"], largest_scales: Float[Tensor, "N"], l
 
 
 def near_raster(points: Float[Tensor, "N 3"], largest_scales: Float[Tensor, "N"], lens: Lens) -> Bool[Tensor, "N"]:
-    """False for splats before the camera of which no published radius and no tile touches the raster.
+    """Marks splats before the camera whose published radius or tiles may touch the raster.
 
-    The largest eigenvalue of a covariance is at most its trace, and that is at most the trace of a ball as large as the
-    longest axis.
+    The largest eigenvalue of a covariance is at most the trace of a ball with the longest axis as radius.
     """
     x, y, z = points.unbind(1)
     across, down = x / z, y / z
@@ -109,8 +108,8 @@ def near_raster(points: Float[Tensor, "N 3"], largest_scales: Float[Tensor, "N"]
     trace = (largest_scales * lens.stretch / z).square() * stretch + (2 * lens.dilation + LEAST_SPREAD)
     reach = lens.deviations * trace.sqrt() + 1
     u, v = lens.fx * across + lens.cx, lens.fy * down + lens.cy
-    beside = (u + reach > lens.left) & (u - reach < lens.right)
-    return beside & (v + reach > lens.top) & (v - reach < lens.bottom)
+    horizontal = (u + reach > lens.left) & (u - reach < lens.right)
+    return horizontal & (v + reach > lens.top) & (v - reach < lens.bottom)
 
 
 def select(
@@ -122,8 +121,10 @@ def select(
     colours: Float[Tensor, "N C"],
     numbers: Float[Tensor, "16"],
 ) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
-    """(splats of which nothing is out of range, those of them that the camera may show). `points`: their means in the
-    camera's frame, float64. A depth that rounds to the near plane is not beyond it."""
+    """Marks splats with all values in range, and those of them near the raster.
+
+    `points`: means in camera coordinates, float64. A depth that rounds to the near plane is not beyond it.
+    """
     lens = Lens(*numbers.unbind())
     a, b, c = scales.abs().unbind(1)
     largest_scales = a.maximum(b).maximum(c)
@@ -137,16 +138,16 @@ def select(
 def selected(
     splats: Splats, points: Float[Tensor, "N 3"], numbers: Float[Tensor, "16"], backend: Backend
 ) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
-    """Calls `select` on splats. The same code serves those without colours, and fields with gaps."""
+    """Calls `select` on splats, with one compiled code also for those without colours and for strided fields."""
     colours = splats.colours if splats.colours.shape[1] else splats.means
     fields = (points, splats.means, splats.scales, splats.quats, splats.log_opacities, colours)
     points, means, scales, quats, log_opacities, colours = (value.detach().contiguous() for value in fields)
     return backend.kernel(select)(points, means, scales, quats, log_opacities, colours, numbers.detach())
 
 
-def chosen_rows(good: Bool[Tensor, "N"], shown: Bool[Tensor, "N"]) -> tuple[Int[Tensor, "M"], int]:
-    """(the rows shown, how many are not good). A GPU is waited for once; on a CPU counting first takes longer."""
+def chosen_rows(good: Bool[Tensor, "N"], visible: Bool[Tensor, "N"]) -> tuple[Int[Tensor, "M"], int]:
+    """Returns the visible rows and the number of splats that are not good; waits for a GPU only once."""
     if good.device.type == "cpu":
-        return shown.nonzero()[:, 0], len(good) - int(good.sum())
-    count, lost = torch.stack([shown.sum(), (~good).sum()]).tolist()
-    return torch.nonzero_static(shown, size=count)[:, 0], lost
+        return visible.nonzero()[:, 0], len(good) - int(good.sum())
+    count, lost = torch.stack([visible.sum(), (~good).sum()]).tolist()
+    return torch.nonzero_static(visible, size=count)[:, 0], lost

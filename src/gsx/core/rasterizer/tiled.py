@@ -1,4 +1,4 @@
-"""Pictures of any size under a memory cap: rendered window by window, without gradient, gathered on the CPU."""
+"""Rendering of large pictures in windows, without gradients, with bounded memory; the result is on the CPU."""
 
 import math
 from collections.abc import Iterator
@@ -17,11 +17,11 @@ from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
 from gsx.core.shapes import Bool, Float
 
 TILE_PIXELS = 1 << 20
-"""Pixels rendered at a time where nothing else is said."""
+"""Default size of a window, px."""
 
 
 def covering(width: int, height: int, pixels: int, unit: int) -> Iterator[Window]:
-    """Squares of at most `pixels` px (but at least one unit) that cover a raster, edges at multiples of `unit` px."""
+    """Yields squares that cover a raster, of at most `pixels` px but at least one unit, at multiples of `unit` px."""
     edge = max(1, math.isqrt(pixels) // unit) * unit
     for top in range(0, height, edge):
         for left in range(0, width, edge):
@@ -30,26 +30,26 @@ def covering(width: int, height: int, pixels: int, unit: int) -> Iterator[Window
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TiledRendering:
-    """A picture gathered from pieces; its tensors are on the CPU and have no gradient."""
+    """Picture assembled from windows, on the CPU and without gradients."""
 
     image: Float[Tensor, "C H W"]
     """Blended colours over the background; not clamped."""
     alpha: Float[Tensor, "H W"]
     """Coverage in [0, 1]."""
     depth: Float[Tensor, "H W"] | None
-    """Blending-weighted sum of camera z, scene units; None unless asked for."""
+    """Blending-weighted sum of camera z, scene units; None: not computed."""
     visible: Bool[Tensor, "N"]
-    """Splats with a radius on the whole raster."""
+    """Splats that touch a tile of the raster."""
     dropped: int
-    """Splats left out because a value of theirs is not finite."""
+    """Number of splats left out because of values that are not finite."""
     windows: int
-    """How many were rendered."""
+    """Number of rendered windows."""
     gathering: float
-    """Seconds that it took to copy them to the CPU."""
+    """Time of copies to the CPU, s."""
 
     @staticmethod
     def empty(splats: Splats, camera: Camera, depth: bool) -> "TiledRendering":
-        """Room for the picture."""
+        """Returns an empty picture."""
         raster, like = (camera.height, camera.width), splats.colours.new_empty(0, device="cpu")
         return TiledRendering(
             image=like.new_empty(splats.colours.shape[1], *raster),
@@ -62,7 +62,7 @@ class TiledRendering:
         )
 
     def put(self, window: Window, part: Rendering) -> None:
-        """Write one piece into its place."""
+        """Copies the render of a window to its place."""
         rows, columns = window.pixels
         self.image[:, rows, columns] = part.image.cpu()
         self.alpha[rows, columns] = part.alpha.cpu()
@@ -79,12 +79,11 @@ def renderings(
     background: Float[Tensor, "C"] | None,
     depth: bool,
 ) -> Iterator[tuple[Window, Rendering]]:
-    """The window's rendering, or those of its halves where it has too many intersections or a GPU too little memory,
-    and so on to one tile."""
+    """Yields the render of a window, or of its halves, down to one tile, if pairs exceed the limit or GPU memory."""
     unit = max(WINDOW_TILE, settings.tile_size)
     try:
         part = rasterize(splats, window.of(camera), settings, background=background, depth=depth)
-    except (TooManyPairs, torch.OutOfMemoryError):  # what a GPU cannot hold
+    except (TooManyPairs, torch.OutOfMemoryError):
         if max(window.width, window.height) <= unit:
             raise
     else:
@@ -104,22 +103,21 @@ def rasterize_tiled(
     depth: bool = False,
     pixels: int = TILE_PIXELS,
 ) -> TiledRendering:
-    """What `rasterize` draws without gradients, bit for bit, in windows of at most `pixels` px (but at least a tile).
+    """Renders the same bits as `rasterize`, without gradients, in windows of at most `pixels` px (but at least a tile).
 
-    Beyond the result, memory grows with `pixels` and with the pairs of one window, not with the raster. Windows that
-    need more than `settings.max_pairs` pairs, or more memory than a GPU has, are halved until they do not.
+    Windows with too many pairs for `settings.max_pairs` or the GPU's memory are halved.
 
     Raises:
         InputError: a single tile needs more pairs than `settings.max_pairs`, or `pixels` is not positive.
     """
     if pixels < 1:
-        raise InputError(f"pieces of {pixels} px hold no picture: give 1 or more, such as {TILE_PIXELS}")
+        raise InputError(f"windows of {pixels} px hold no picture: give 1 or more, such as {TILE_PIXELS}")
     tiled, count, dropped, gathering = TiledRendering.empty(splats, camera, depth), 0, 0, 0.0
     device = splats.means.device
     for window in covering(camera.width, camera.height, pixels, max(WINDOW_TILE, settings.tile_size)):
         for place, part in renderings(splats, camera, settings, window, background, depth):
-            begun = clock(device)
+            start = clock(device)
             tiled.put(place, part)
-            gathering += clock(device) - begun
+            gathering += clock(device) - start
             count, dropped = count + 1, part.dropped
     return replace(tiled, windows=count, dropped=dropped, gathering=gathering)

@@ -1,4 +1,4 @@
-"""Which Gaussians touch the picture at all, and how large they are there, without drawing it."""
+"""Visibility and screen size of Gaussians, without a render."""
 
 import torch
 from torch import Tensor
@@ -19,9 +19,9 @@ def touches(
     camera: Camera,
     settings: RasterSettings,
 ) -> Bool[Tensor, "N"]:
-    """Gaussians in front of the camera whose published 3-sigma square's tiles touch its raster (3D-GS, forward.cu).
+    """Marks Gaussians whose published 3-sigma square has tiles on the camera's raster (3D-GS, forward.cu).
 
-    Those that have no such square, because something is out of range, are not held back either: the render counts them.
+    Gaussians with values out of range are marked as well; the render counts them.
     """
     opaque = without_colours(means, scales, quats)
     screen, on = on_screen(opaque, camera, settings)
@@ -31,13 +31,13 @@ def touches(
 
 
 def without_colours(means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]) -> Splats:
-    """Opaque Gaussians of no colour."""
+    """Returns opaque Gaussians without channels."""
     return Splats(
         means=means, scales=scales, quats=quats, log_opacities=torch.zeros_like(means[:, 0]), colours=means[:, :0]
     )
 
 
 def on_screen(splats: Splats, camera: Camera, settings: RasterSettings) -> tuple[ScreenSplats, Bool[Tensor, "M"]]:
-    """(splats that the camera may show, those of them whose published square's tiles touch the raster)."""
+    """Returns splats near the raster, and marks those whose published square has tiles on it."""
     screen = project(splats, camera, settings)
     return screen, boxes_of(screen, camera, settings).radii > 0

@@ -70,8 +70,8 @@ class Replacing(Protocol):
 class Accounting(Protocol):
     """An augmenter that counts the pictures it requests and loses.
 
-    An account has `event`, the model's step at the last event, and counts by scale: `asked`, `dropped`, and `warned` by
-    check.
+    An account has `event`, the model's step at the last event, and counts by scale: requests (`asked`),
+    `dropped`, and `warned` by check.
     """
 
     def account(self, step: int) -> dict[str, Any]:
