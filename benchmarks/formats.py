@@ -23,8 +23,7 @@ import numpy as np
 import torch
 
 from gsx.builtin import plugins
-from gsx.core.gaussians.drawn import splats_of
-from gsx.core.gaussians.splats import Gaussians
+from gsx.core.gaussians.splats import Gaussians, splats_of
 from gsx.core.quality.metrics import psnr
 from gsx.core.training.render import render
 from gsx.core.training.run import Run

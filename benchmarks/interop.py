@@ -27,8 +27,7 @@ from gsx import __version__
 from gsx.builtin import plugins
 from gsx.core.errors import GsxError, InputError
 from gsx.core.gaussians.bands import BAND_0
-from gsx.core.gaussians.drawn import splats_of
-from gsx.core.gaussians.splats import Gaussians
+from gsx.core.gaussians.splats import Gaussians, splats_of
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Float, Int
 from gsx.core.training.render import render

@@ -206,7 +206,7 @@ def test_squares_of_two_scales(background: str, tmp_path: Path, monkeypatch: pyt
     run = run_at(tmp_path / "run", 60, *words, gain=0.32)
     run.sampler.order = [2]
     renders = []
-    monkeypatch.setattr("gsx.core.training.forward.rasterize", lambda *a, **k: renders.append(a) or rasterize(*a, **k))
+    monkeypatch.setattr("gsx.core.training.render.rasterize", lambda *a, **k: renders.append(a) or rasterize(*a, **k))
     step = backward(run)
     assert len(renders) == (3 if background == "true" else 2)
     found = copied_gradients(run)

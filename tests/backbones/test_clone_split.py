@@ -30,7 +30,7 @@ from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError
-from gsx.core.gaussians.drawn import splats_of
+from gsx.core.gaussians.splats import splats_of
 from gsx.core.rasterizer import RasterSettings, Rendering, rasterize
 from gsx.core.training.backbone import Backbone, BackboneContext, DrawnSplats
 from gsx.core.training.parameter_table import size_of

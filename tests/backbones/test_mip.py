@@ -26,8 +26,7 @@ from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.gaussians.drawn import splats_of
-from gsx.core.gaussians.splats import Splats
+from gsx.core.gaussians.splats import Splats, splats_of
 from gsx.core.quality.losses import photometric
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings, ScreenStatistics, rasterize, rasterize_tiled

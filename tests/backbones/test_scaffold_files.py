@@ -9,7 +9,7 @@ from test_anchors import NAMES, NEURAL, small_anchors, stir
 
 from gsx.backbones.anchor_grids import LevelGrids
 from gsx.core.errors import InputError
-from gsx.core.gaussians.drawn import splats_of
+from gsx.core.gaussians.splats import splats_of
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import rasterize
 from gsx.formats.ply import read_ply

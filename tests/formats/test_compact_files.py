@@ -16,8 +16,7 @@ from PIL import Image
 
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.errors import InputError
-from gsx.core.gaussians.drawn import splats_of
-from gsx.core.gaussians.splats import Gaussians
+from gsx.core.gaussians.splats import Gaussians, splats_of
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 from gsx.formats.arrays import arrays_of
 from gsx.formats.axes import to_training_axes

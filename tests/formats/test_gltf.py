@@ -16,8 +16,7 @@ from foreign_gltf import PREFIX, Builder, glb
 from test_compact_files import many
 
 from gsx.core.errors import InputError
-from gsx.core.gaussians.drawn import splats_of
-from gsx.core.gaussians.splats import Gaussians
+from gsx.core.gaussians.splats import Gaussians, splats_of
 from gsx.formats.arrays import arrays_of
 from gsx.formats.splat_files import is_linear, read_gaussians
 from gsx.formats.spz import encode_spz

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.errors import InputError
-from gsx.core.gaussians.drawn import splats_of
-from gsx.core.gaussians.splats import Gaussians
+from gsx.core.gaussians.splats import Gaussians, splats_of
 from gsx.formats.splat_files import read_gaussians, write_gaussians
 
 PROPERTIES = (

@@ -14,8 +14,7 @@ from gsx.augmenters.timing import event_at
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.data.reduction import Reduction
 from gsx.core.errors import InputError
-from gsx.core.files import replace_file
-from gsx.core.training.checkpoint_files import sidecars, step_of
+from gsx.core.files import replace_file, sidecars, step_of
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.run import Run
 

@@ -173,3 +173,13 @@ def read_json(path: Path) -> Any:
         raise ValueError("its brackets are nested too deeply") from error
     except ValueError as error:
         raise (ValueError(f"it is {LFS_REMEDY}") if is_lfs_pointer(path) else error) from None
+
+
+def sidecars(folder: Path) -> list[Path]:
+    """Returns the JSON files of a checkpoint folder, oldest first."""
+    return sorted(path for path in folder.glob("step_*.json") if path.stem.removeprefix("step_").isdecimal())
+
+
+def step_of(sidecar: Path) -> int:
+    """Returns the step of a checkpoint."""
+    return int(sidecar.stem.removeprefix("step_"))

@@ -12,7 +12,7 @@ from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import Rendering, rasterize, rasterize_tiled, tiled
-from gsx.core.rasterizer.tiled import covering
+from gsx.core.rasterizer.render import covering
 from gsx.engine.compiled import available
 
 

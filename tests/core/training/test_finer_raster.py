@@ -26,9 +26,8 @@ from gsx.core.errors import ConfigError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.training.finer_raster import finer_raster, times_as_fine
-from gsx.core.training.forward import render_for_training
 from gsx.core.training.module import Modules
-from gsx.core.training.render import render
+from gsx.core.training.render import render, render_for_training
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.runs.execute import execute

@@ -13,10 +13,9 @@ from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.data.camera import look_at, offsets_from
 from gsx.core.errors import InputError
-from gsx.core.gaussians.drawn import splats_of
 from gsx.core.gaussians.quaternions import rotation_matrices
 from gsx.core.gaussians.sh import colours_of
-from gsx.core.gaussians.splats import Splats
+from gsx.core.gaussians.splats import Splats, splats_of
 from gsx.core.quality.metrics import psnr
 from gsx.core.training.render import render
 from gsx.experiments.runs import bake as baking

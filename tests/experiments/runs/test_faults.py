@@ -303,7 +303,7 @@ def test_a_damaged_photograph_is_told_before_a_folder_exists(
 )
 def test_a_sidecar_with_numbers_of_no_step_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
     """The digest is that of the tensors: numbers beside it are looked at by themselves."""
-    from gsx.core.training.checkpoint_files import step_of
+    from gsx.core.files import step_of
     from gsx.experiments.run_folder.checkpoint import sound
 
     sidecar = tmp_path / "step_0000004.json"
@@ -313,7 +313,7 @@ def test_a_sidecar_with_numbers_of_no_step_is_refused(tmp_path: Path, change: di
 
 
 def test_other_files_beside_checkpoints_are_none(tmp_path: Path) -> None:
-    from gsx.core.training.checkpoint_files import sidecars
+    from gsx.core.files import sidecars
 
     for name in ("step_0000004.json", "step_copy.json", "step_.json"):
         (tmp_path / name).write_text("{}")

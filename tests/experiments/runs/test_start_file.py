@@ -14,7 +14,7 @@ from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.data.resize import to_uint8
 from gsx.core.errors import ConfigError, InputError
-from gsx.core.gaussians.drawn import splats_of
+from gsx.core.gaussians.splats import splats_of
 from gsx.core.rasterizer import RasterSettings
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.run_folder.run_key import composition_key, scene_stamp

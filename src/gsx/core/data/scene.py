@@ -20,11 +20,9 @@ class ImageSource(Protocol):
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """Returns the image for a camera: the view's camera at any zoom up to `max_zoom`, or a crop of it."""
-        ...
 
     def max_zoom(self, camera: Camera) -> float:
         """Returns the largest zoom of a camera with an image (1: none finer; inf: any)."""
-        ...
 
 
 @runtime_checkable
@@ -33,7 +31,6 @@ class Masked(Protocol):
 
     def counted(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
         """Marks the unmasked pixels of `image(camera)`; None: all."""
-        ...
 
 
 @runtime_checkable
@@ -42,7 +39,6 @@ class CutOut(Protocol):
 
     def transparent(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
         """Marks the pixels of `image(camera)` that show only background; None: unknown."""
-        ...
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -2,11 +2,17 @@
 
 import torch
 
+from gsx.core.rasterizer.intersections import on_screen, touches, without_colours
 from gsx.core.rasterizer.projection import drawable, repeat_rows, take_rows
-from gsx.core.rasterizer.render import Rendering, ScreenStatistics, rasterize
+from gsx.core.rasterizer.render import (
+    TILE_PIXELS,
+    Rendering,
+    ScreenStatistics,
+    TiledRendering,
+    rasterize,
+    rasterize_tiled,
+)
 from gsx.core.rasterizer.settings import RasterOptions, RasterSettings
-from gsx.core.rasterizer.tiled import TILE_PIXELS, TiledRendering, rasterize_tiled
-from gsx.core.rasterizer.visibility import on_screen, touches, without_colours
 
 __all__ = [
     "TILE_PIXELS",

@@ -129,13 +129,8 @@ def spans(
 ) -> tuple[Int[Tensor, "R"], Int[Tensor, "R"], Int[Tensor, "R"]]:
     """Returns tile row, first column and number of columns of each row of tiles of V splats.
 
-    Args:
-        rank: Splat of each row.
-        shapes: Mean x, mean y, u0, u1, u2, limit.
-        sides: First row, first and past-the-last column.
-        starts: Index of each splat's first row.
-        tile: Edge of the tiles, px.
-        reach: As for `row_spans`.
+    `rank`: splat of each row; `shapes`: mean x, mean y, u0, u1, u2, limit; `sides`: first row, first and past-the-last
+    column; `starts`: index of each splat's first row.
     """
     mean_x, mean_y, u0, u1, u2, limit = (column[rank] for column in shapes.unbind(1))
     top, left, right = (column[rank] for column in sides.unbind(1))

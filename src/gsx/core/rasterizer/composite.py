@@ -253,7 +253,7 @@ def blend_all(
 def all_gradients(
     tables: Tables, fronts: list[Front], gradient: Float[Tensor, "T C P"], absolute: bool
 ) -> tuple[Float[Tensor, "S K 6"], Float[Tensor, "S K C"], Float[Tensor, "S K 2"] | None]:
-    """Returns each list entry's gradients: of its row, its channels and, with `absolute`, the absolute one of its mean."""
+    """Returns each list entry's gradients: row, channels and, with `absolute`, the absolute one of its mean."""
     shape, of_pair = tables.rows.shape[:2], tables.rows
     rest = gradient.new_zeros(gradient.shape[0], gradient.shape[2])
     rows, channels = of_pair.new_zeros(*shape, 6), of_pair.new_zeros(*shape, tables.channels.shape[2])

@@ -37,7 +37,6 @@ class Compositor(Protocol):
 
         If `screen.absgrad` is not None, its gradient becomes the sum of absolute gradients of the mean, px.
         """
-        ...
 
 
 @runtime_checkable
@@ -53,4 +52,3 @@ class Restricted(Protocol):
 
     def refuse(self, settings: "RasterSettings", device: torch.device) -> None:
         """Raises ConfigError, with a remedy, if it does not work with these settings on a device."""
-        ...

@@ -120,17 +120,9 @@ def geometry(
 ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M"] | None]:
     """Returns screen means (px of the frame), dilated covariances, their factors, and ln of the opacity factor or None.
 
-    Args:
-        points: Means in camera coordinates, float64.
-        scales: Standard deviations, world units.
-        quats: Rotations (w, x, y, z) of any length.
-        rotation: Camera from world.
-        intrinsics: (fx, fy, cx, cy) on the frame, float64.
-        low: Lower bounds of x/z and y/z in the Jacobian.
-        high: Upper bounds.
-        dilation: px^2.
-        compensate: True: the opacity factor compensates the whole dilation.
-        drawn: Dilation that opacities are trained for, px^2: the factor compensates the difference; None: no factor.
+    `points`: means in camera coordinates, float64; `intrinsics`: (fx, fy, cx, cy) on the frame, float64; `low`, `high`:
+    bounds of x/z and y/z in the Jacobian; `dilation`, px^2; the opacity factor compensates all of it (`compensate`), or
+    its difference from `drawn`, the dilation in training.
     """
     x, y, z = points.unbind(1)
     fx, fy, cx, cy = intrinsics

@@ -14,13 +14,14 @@ from gsx.core.backend import EAGER
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.device import uploaded
 from gsx.core.errors import TooManyPairs
+from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.bags import bag_sums, edges_of
 from gsx.core.rasterizer.boxes import boxes, spans
 from gsx.core.rasterizer.grid import TileGrid
-from gsx.core.rasterizer.projection import ScreenSplats
+from gsx.core.rasterizer.projection import ScreenSplats, drawable, project
 from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
 from gsx.core.rasterizer.sorting import sorted_stably
-from gsx.core.shapes import Float, Int
+from gsx.core.shapes import Bool, Float, Int
 
 WINDOW_REACH = 1.25
 """Reach of a pixel's window from its centre, px: half a diagonal, and the growth of a window cut by a needle."""
@@ -148,17 +149,7 @@ def sorted_pairs(
     grid: TileGrid,
     radii: Int[Tensor, "M"],
 ) -> TileIntersections:
-    """Sorts intersections by tile.
-
-    Args:
-        order: Splats, nearest first.
-        rank: Index into `order` of each span of `widths` tiles.
-        widths: Number of tiles of each span.
-        line: Span of each intersection.
-        tiles: Tile of each intersection.
-        grid: Grid of the tiles.
-        radii: Published radii.
-    """
+    """Sorts intersections by tile; `rank`: splat of each span of `widths` tiles, `line`: span of each intersection."""
     columns, rows = grid.shape
     narrow = torch.int16 if columns * rows <= torch.iinfo(torch.int16).max else torch.int32  # sorted fastest
     tiles, slots = sorted_stably(tiles.to(narrow))
@@ -215,3 +206,35 @@ def capped(every: TileIntersections, cap: int) -> TileIntersections:
         slots=(kept_by_splat.cumsum(0) - 1)[every.slots[kept]],
         counts=torch.bincount(owner[kept_by_splat], minlength=len(every.counts)),
     )
+
+
+@torch.no_grad()
+def touches(
+    means: Float[Tensor, "N 3"],
+    scales: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    camera: Camera,
+    settings: RasterSettings,
+) -> Bool[Tensor, "N"]:
+    """Marks Gaussians whose published 3-sigma square has tiles on the camera's raster (3D-GS, forward.cu).
+
+    Gaussians with values out of range are marked as well; the render counts them.
+    """
+    opaque = without_colours(means, scales, quats)
+    screen, on = on_screen(opaque, camera, settings)
+    mask = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+    mask.index_copy_(0, screen.ids, on)
+    return mask | ~drawable(opaque, camera, settings) if screen.dropped else mask
+
+
+def without_colours(means: Float[Tensor, "N 3"], scales: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]) -> Splats:
+    """Returns opaque Gaussians without channels."""
+    return Splats(
+        means=means, scales=scales, quats=quats, log_opacities=torch.zeros_like(means[:, 0]), colours=means[:, :0]
+    )
+
+
+def on_screen(splats: Splats, camera: Camera, settings: RasterSettings) -> tuple[ScreenSplats, Bool[Tensor, "M"]]:
+    """Returns splats near the raster, and marks those whose published square has tiles on it."""
+    screen = project(splats, camera, settings)
+    return screen, boxes_of(screen, camera, settings).radii > 0

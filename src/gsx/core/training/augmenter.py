@@ -46,15 +46,12 @@ class Augmenter(Protocol):
 
         The first call in a window makes its pseudo views, from the current model.
         """
-        ...
 
     def begins(self) -> int:
         """Returns the number of first steps that do not depend on this augmenter."""
-        ...
 
     def plan(self) -> dict[str, Any]:
         """Returns the rescaled schedule in absolute steps, for log and report."""
-        ...
 
 
 @runtime_checkable
@@ -63,7 +60,6 @@ class Replacing(Protocol):
 
     def share(self) -> float:
         """Returns the largest part; the parts of all augmenters of a run must add up to less than 1."""
-        ...
 
 
 @runtime_checkable
@@ -76,11 +72,9 @@ class Accounting(Protocol):
 
     def account(self, step: int) -> dict[str, Any]:
         """Returns the account of the pictures requested at a step; empty: none were."""
-        ...
 
     def recall(self, accounts: Sequence[Mapping[str, Any]]) -> None:
         """Restores the accounts of a resumed run."""
-        ...
 
 
 @runtime_checkable
@@ -89,7 +83,6 @@ class KnownStart(Protocol):
 
     def begins(self, iterations: int) -> int:
         """Returns `Augmenter.begins` for a run of that length."""
-        ...
 
 
 def accounts_of(run: "Run", step: int) -> dict[str, dict[str, Any]]:

@@ -87,12 +87,10 @@ class Drawn(Protocol):
     @property
     def splats(self) -> Splats:
         """M Gaussians, differentiable."""
-        ...
 
     @property
     def rows(self) -> Int[Tensor, "M"] | None:
         """Table row of each splat; None: splat n is row n."""
-        ...
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -123,11 +121,9 @@ class Backbone(Protocol[D]):
 
     def draw(self, camera: Camera, step: int) -> D:
         """Returns the splats for a camera at a step."""
-        ...
 
     def regulariser(self, drawn: D) -> Float[Tensor, ""] | None:
         """Returns a term of the view's loss, or None."""
-        ...
 
     def observe(self, drawn: D, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
         """Returns the statistics of a render for density control, after its backward pass.
@@ -138,19 +134,15 @@ class Backbone(Protocol[D]):
             step: Current step.
             weight: Weight of the render in the step's loss (`backbones.density`).
         """
-        ...
 
     def accumulate(self, observation: Observation) -> None:
         """Adds an observation, of this or another process, to the statistics."""
-        ...
 
     def densify_and_prune(self, step: int) -> Mapping[str, float]:
         """Adds and removes rows; returns metrics for the log, empty if nothing changed."""
-        ...
 
     def update(self, step: int) -> None:
         """Updates the parameters by the learning rates of this step, and clears their gradients."""
-        ...
 
     def explicit(self, camera: Camera | None, step: int) -> Gaussians:
         """Returns Gaussians for a standard splat file, as drawn for a camera or, with None, for all cameras.
@@ -158,7 +150,6 @@ class Backbone(Protocol[D]):
         Raises:
             GsxError: the camera is None, and the splats depend on the camera.
         """
-        ...
 
 
 @runtime_checkable
@@ -167,7 +158,6 @@ class Planned(Protocol):
 
     def plan(self) -> dict[str, Any]:
         """Returns the rescaled schedule in absolute steps: numbers or lists by name, grouped by name; see CAUTION."""
-        ...
 
 
 @runtime_checkable
@@ -176,7 +166,6 @@ class WithMilestones(Protocol):
 
     def milestones(self) -> Sequence[int]:
         """Returns steps at which it acts once, or after which it stops acting."""
-        ...
 
 
 @runtime_checkable
@@ -185,7 +174,6 @@ class Validating(Protocol):
 
     def validation_window(self, view: View, step: int) -> Window | None:
         """Returns the view's window that enters no loss at a step; None: no window."""
-        ...
 
 
 @runtime_checkable
@@ -194,7 +182,6 @@ class Backdrop(Protocol):
 
     def behind_scene(self, means: Float[Tensor, "M 3"]) -> Bool[Tensor, "M"]:
         """Marks splats too far away for any camera to measure their depth."""
-        ...
 
 
 def behind_scene(backbone: Backbone[Any], means: Float[Tensor, "M 3"]) -> Bool[Tensor, "M"]:
@@ -210,7 +197,6 @@ class PseudoViewListener(Protocol):
 
     def pseudo_views_made(self, views: Sequence[PseudoView], step: int) -> None:
         """Receives the pseudo views made for a step, before density control and update; mostly none."""
-        ...
 
 
 @runtime_checkable
@@ -227,11 +213,9 @@ class WithOwnFile(Protocol):
 
     def file_columns(self) -> dict[str, Float[Tensor, "N"]] | None:
         """Returns the columns of that file, in order; None: a standard file is complete."""
-        ...
 
     def file_notes(self) -> list[str]:
         """Returns comments for its files: hints for viewers other than the screen dilation."""
-        ...
 
 
 @runtime_checkable
@@ -240,14 +224,12 @@ class Bakeable(Protocol):
 
     def slot_count(self) -> int:
         """Returns the number of slots."""
-        ...
 
     def slots(self, drawn: Any) -> tuple[Int[Tensor, "M"], Int[Tensor, "V"]]:
         """Returns the slot of each drawn splat, and the slots of all candidates of this camera.
 
         Candidates that are not drawn have opacity 0 for this camera.
         """
-        ...
 
 
 @runtime_checkable
@@ -260,7 +242,6 @@ class FromGaussians(Protocol):
         Raises:
             InputError: its options do not allow that.
         """
-        ...
 
 
 @torch.no_grad()

@@ -12,9 +12,9 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.window import Window
 from gsx.core.shapes import Float
 from gsx.core.training.backbone import Observation, PseudoViewListener
-from gsx.core.training.forward import observe, render_for_training
 from gsx.core.training.parameter_table import shared_colour
 from gsx.core.training.pseudo_views import PseudoView, Term, mask_windows, pseudo_loss
+from gsx.core.training.render import observe, render_for_training
 from gsx.core.training.run import Run
 
 Divided: TypeAlias = tuple[Term, Sequence[tuple[PseudoView, float]]]

@@ -74,11 +74,9 @@ class Regenerator(Protocol):
 
     def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         """Learns from the scene, if anything; returns metrics for the log. Called at every event."""
-        ...
 
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
         """Returns a picture for each request, in order; display values."""
-        ...
 
 
 @runtime_checkable
@@ -87,7 +85,6 @@ class NamesCode(Protocol):
 
     def named_code(self) -> str:
         """Returns the module or file that it runs; empty: none. Runs with such code resume only in trusted folders."""
-        ...
 
 
 @runtime_checkable
@@ -105,4 +102,3 @@ class Checkable(Protocol):
         Raises:
             ConfigError, InputError: it cannot.
         """
-        ...

@@ -18,11 +18,11 @@ from gsx.core.quality.losses import photometric
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.augmenter import accounts_of
 from gsx.core.training.backbone import Observation, Validating, remove_nonfinite
-from gsx.core.training.forward import observe, render_for_training
 from gsx.core.training.minibatch import gradients_added, merge_gradients, rollback_on_error
 from gsx.core.training.parameter_table import zero_grad
 from gsx.core.training.pseudo_terms import backward_terms, request_terms, reusable_parts, reused_losses, without_windows
 from gsx.core.training.pseudo_views import Term
+from gsx.core.training.render import observe, render_for_training
 from gsx.core.training.run import Run, StepResult
 
 logger = logging.getLogger(__name__)

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError, first_line
-from gsx.core.gaussians.drawn import splats_of
-from gsx.core.gaussians.splats import Gaussians
+from gsx.core.gaussians.splats import Gaussians, splats_of
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Float
 from gsx.core.training.importance import ROUNDING

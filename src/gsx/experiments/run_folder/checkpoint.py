@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.errors import CheckpointError, InputError
-from gsx.core.files import read_json, refuse_lfs_pointer, replace_file, write_json
-from gsx.core.training.checkpoint_files import sidecars, step_of
+from gsx.core.files import read_json, refuse_lfs_pointer, replace_file, sidecars, step_of, write_json
 from gsx.core.training.parameter_table import restored_table, table_tensors
 from gsx.core.training.run import Run
 

@@ -21,7 +21,7 @@ def splats_problem(path: Path) -> str:
 
 def newest_checkpoint(folder: Path) -> int:
     """Returns the step of a run's newest checkpoint; -1: it has none."""
-    from gsx.core.training.checkpoint_files import sidecars, step_of
+    from gsx.core.files import sidecars, step_of
 
     return max(map(step_of, sidecars(folder / "checkpoints")), default=-1)
 
@@ -30,7 +30,7 @@ def checkpoint_problem(folder: Path) -> str:
     """Describes what is wrong with a run's newest checkpoint by its sidecar and header; empty: nothing, or none."""
     from safetensors import SafetensorError, safe_open
 
-    from gsx.core.training.checkpoint_files import sidecars, step_of
+    from gsx.core.files import sidecars, step_of
     from gsx.experiments.run_folder.checkpoint import sound
 
     for sidecar in sidecars(folder / "checkpoints")[-1:]:

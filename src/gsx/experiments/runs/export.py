@@ -13,8 +13,7 @@ from gsx import __version__
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import GsxError, InputError
-from gsx.core.gaussians.drawn import splats_of
-from gsx.core.gaussians.splats import Gaussians
+from gsx.core.gaussians.splats import Gaussians, splats_of
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings
 from gsx.core.rasterizer.settings import PIXEL_VARIANCE

@@ -9,8 +9,7 @@ from torch.nn.functional import grid_sample, interpolate
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
-from gsx.core.gaussians.drawn import splats_of
-from gsx.core.gaussians.splats import Gaussians, Splats
+from gsx.core.gaussians.splats import Gaussians, Splats, splats_of
 from gsx.core.quality.metrics import bicubic
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 from gsx.core.shapes import Bool, Float
