@@ -487,9 +487,9 @@ def test_the_cap_is_never_passed(name: str) -> None:
     backbone = judged(name, f"max_primitives={count + 2}")
     free = judged(name, "max_primitives=0").densify_and_prune(1600)
     assert "withheld" not in free
-    capped = backbone.densify_and_prune(1600)
-    assert (capped["grown"], capped["pruned"]) == (2, 5)
-    assert capped["withheld"] >= free["grown"] - 2  # what found no room takes no finer anchor's cell either
+    cap_tiles = backbone.densify_and_prune(1600)
+    assert (cap_tiles["grown"], cap_tiles["pruned"]) == (2, 5)
+    assert cap_tiles["withheld"] >= free["grown"] - 2  # what found no room takes no finer anchor's cell either
     full = judged(name, f"max_primitives={count - 7}").densify_and_prune(1600)
     assert (full["grown"], full["pruned"]) == (0, 5)
     assert full["withheld"] > 0

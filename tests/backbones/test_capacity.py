@@ -182,8 +182,8 @@ def test_an_event_on_anchors_adds_what_there_is_room_for(monkeypatch: pytest.Mon
 def test_a_cap_that_holds_growth_is_told() -> None:
     scene = small_scene(spread(50))
     model = small_gs3d(scene, options=options_of("adaptive"))
-    capped = Adaptive(AdaptiveOptions(rate=0.3), small_context(scene), PUBLISHED, 57)
-    assert capped.evaluate(model, lambda table: None, 700) == {"withheld": 8}  # 15 asked for, room for 7
+    cap_tiles = Adaptive(AdaptiveOptions(rate=0.3), small_context(scene), PUBLISHED, 57)
+    assert cap_tiles.evaluate(model, lambda table: None, 700) == {"withheld": 8}  # 15 asked for, room for 7
 
 
 def test_what_no_view_shows_outlives_a_budget() -> None:
@@ -314,8 +314,8 @@ def test_growth_goes_by_steps_not_by_events(every: int, room: int) -> None:
 def test_the_cap_holds_growth() -> None:
     scene = small_scene(spread(50))
     table = small_gs3d(scene, options=options_of("adaptive")).table
-    capped = Adaptive(AdaptiveOptions(rate=0.3), small_context(scene), PUBLISHED, 57)
-    assert capped.room(table, 50, 700) == 7
+    cap_tiles = Adaptive(AdaptiveOptions(rate=0.3), small_context(scene), PUBLISHED, 57)
+    assert cap_tiles.room(table, 50, 700) == 7
 
 
 @pytest.mark.parametrize(("had", "price", "rate"), [(2.0, 0.4, 0.2), (1.0, 0.6, 0.05), (10**0.06, 0.2, 0.1)])

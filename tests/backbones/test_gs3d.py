@@ -16,7 +16,7 @@ from gsx.core.errors import InputError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, Rendering, ScreenStatistics, rasterize
 from gsx.core.training.backbone import Backbone, DrawnSplats
-from gsx.core.training.parameter_table import gradients, restored_table, size_of, table_tensors, zero_grad
+from gsx.core.training.parameter_table import gradients, restore_table, size_of, table_tensors, zero_grad
 
 NAMES = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
 
@@ -449,7 +449,7 @@ def test_restored_backbone_goes_on_bit_for_bit() -> None:
     assert any(done.get("split", 0) or done.get("cloned", 0) for done in grown)
     saved = {name: value.clone() for name, value in table_tensors(first.table).items()}
     second = small_gs3d(small_scene(spread(3), views=2), iterations=300, seed=5)  # another cloud, another size
-    second.table = restored_table(second.table, {name: value.clone() for name, value in saved.items()})
+    second.table = restore_table(second.table, {name: value.clone() for name, value in saved.items()})
     assert table_tensors(second.table).keys() == saved.keys()
     assert all(torch.equal(value, saved[name]) for name, value in table_tensors(second.table).items())
     second.control.generator.set_state(first.control.generator.get_state())
@@ -463,6 +463,6 @@ def test_restored_backbone_goes_on_bit_for_bit() -> None:
 
 def test_untrained_backbone_can_be_restored() -> None:
     first, second = small_gs3d(small_scene(spread(5))), small_gs3d(small_scene(spread(9)), seed=1)
-    second.table = restored_table(second.table, table_tensors(first.table))
+    second.table = restore_table(second.table, table_tensors(first.table))
     assert torch.equal(second.table["means"], first.table["means"])
     assert second.table.optimiser.state == {}

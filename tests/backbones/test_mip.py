@@ -30,7 +30,7 @@ from gsx.core.gaussians.splats import Splats, splats_of
 from gsx.core.quality.losses import photometric
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings, ScreenStatistics, rasterize, rasterize_tiled
-from gsx.core.training.parameter_table import gradients, restored_table, table_tensors
+from gsx.core.training.parameter_table import gradients, restore_table, table_tensors
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -499,7 +499,7 @@ def test_absolute_sums_are_those_of_a_loop_over_pixels() -> None:
 def test_absolute_sums_are_saved_and_restored() -> None:
     first, second = (row_values([0.1] * 3, [0.5] * 3, [1.0] * 3, [3.0, 4, 5]) for _ in range(2))
     zero_statistics(second.table)
-    second.table = restored_table(
+    second.table = restore_table(
         second.table, {name: value.clone() for name, value in table_tensors(first.table).items()}
     )
     assert mean_absolute(second.table).tolist() == [3.0, 4, 5]

@@ -10,7 +10,7 @@ from gsx.backbones.gs3d import GS3D
 from gsx.backbones.sh_degrees import kept_bands, least_degrees, numbers_of
 from gsx.core.data.camera import look_at
 from gsx.core.data.scene import View
-from gsx.core.training.parameter_table import restored_table, table_tensors
+from gsx.core.training.parameter_table import restore_table, table_tensors
 
 NUMBERS = [14, 23, 38, 59]
 JUDGED = 24000
@@ -98,7 +98,7 @@ def test_bands_that_have_not_begun_to_learn_are_not_judged() -> None:
 def test_degrees_are_saved_with_the_model() -> None:
     model = shiny()
     model.densify_and_prune(JUDGED)
-    again = restored_table(shiny().table, table_tensors(model.table))
+    again = restore_table(shiny().table, table_tensors(model.table))
     assert again["sh_degree"].tolist() == [2, 2, 2, 0, 0, 0]
 
 

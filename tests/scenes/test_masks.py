@@ -10,7 +10,7 @@ from refusals import refused
 import gsx
 from gsx.core.data.camera import look_at
 from gsx.core.data.images import ImageCache, read_image, write_image
-from gsx.core.data.masks import Mask, blacked
+from gsx.core.data.masks import Mask, black_out
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.resize import ResizeRule
 from gsx.core.data.scene import View
@@ -131,7 +131,7 @@ def test_figures_are_over_what_counts():
     counted = torch.rand(30, 40, generator=NOISE) < 0.7
     errors = ((image - truth) ** 2).numpy()[:, counted.numpy()].astype(np.float64)
     assert psnr(image, truth, counted) == pytest.approx(-10 * np.log10(errors.mean()), abs=1e-4)
-    shown = [blacked(picture, counted) for picture in (image, truth)]
+    shown = [black_out(picture, counted) for picture in (image, truth)]
     assert float(shown[0][:, ~counted].abs().sum()) == 0
     padded = ssim_map(*shown)[:, counted].mean()
     assert ssim(*shown, "inria", counted) == pytest.approx(float(padded), abs=1e-6)

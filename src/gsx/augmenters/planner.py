@@ -9,7 +9,7 @@ import torch
 from gsx.augmenters.cameras import centred_window, grid_window, moved, noise, random_window, window_size, worst_window
 from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.core.data.camera import Camera
-from gsx.core.data.masks import blacked
+from gsx.core.data.masks import black_out
 from gsx.core.data.window import Window
 from gsx.core.seeds import derived_seed
 from gsx.core.training.render import render
@@ -145,7 +145,7 @@ class Planner:
             return grid_window(width, height, size, self.events.index(slot.event) * each + place + slot.parent)
         if kind == "error":
             view = run.train_views[slot.parent]
-            error = blacked(render(run, pose).image - view.image(), view.counted())
+            error = black_out(render(run, pose).image - view.image(), view.counted())
             return worst_window(error.abs().mean(0), size)
         return centred_window(width, height, size)
 

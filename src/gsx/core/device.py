@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 
-def uploaded(values: Tensor, device: torch.device, dtype: torch.dtype | None = None) -> Tensor:
+def upload(values: Tensor, device: torch.device, dtype: torch.dtype | None = None) -> Tensor:
     """Copies values to a device without waiting for it; differentiable."""
     if device.type == "cuda" and values.device.type == "cpu" and not values.requires_grad:
         values = values.pin_memory()  # asynchronous copies need pinned memory

@@ -92,13 +92,13 @@ def remove_partial(folder: Path, below: bool = True) -> None:
             if found := MARKED.match(name):
                 with suppress(OSError):
                     path = Path(place, name)
-                    if gone(found["machine"], int(found["process"]), path):
+                    if has_ended(found["machine"], int(found["process"]), path):
                         shutil.rmtree(path) if path.is_dir() else path.unlink()
         if not below:
             inner.clear()
 
 
-def gone(machine: str, process: int, path: Path) -> bool:
+def has_ended(machine: str, process: int, path: Path) -> bool:
     """Returns whether the writer of a temporary file has ended; on other machines, whether the file is old."""
     if machine != process_tag().rpartition("-")[0] or os.name != "posix":
         return time.time() - path.stat().st_mtime > ABANDONED

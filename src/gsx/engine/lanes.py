@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gsx.core.device import uploaded
+from gsx.core.device import upload
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.shapes import Float, Int
@@ -104,7 +104,7 @@ def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: in
     counts[1::batch] = counts[::batch][: len(counts[1::batch])]
     active = (len(counts) - counts.bincount().cumsum(0))[:-1]
     bases, blocks = active.cumsum(0) - active, int(active.sum())
-    table = uploaded(torch.stack([active, bases]), lanes.device)
+    table = upload(torch.stack([active, bases]), lanes.device)
     chunks = torch.repeat_interleave(table[0], output_size=blocks)
     groups = torch.arange(blocks, device=chunks.device) - table[1][chunks]
     pairs = pairs_in_blocks(lists, len(intersections.splats), lanes, groups, chunks, chunk)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsx.core.rasterizer import repeat_rows
-from gsx.core.rasterizer.bags import bag_sums, runs_added
+from gsx.core.rasterizer.bags import bag_sums, sum_runs
 
 
 def test_each_row_is_the_sum_of_its_bag() -> None:
@@ -23,4 +23,4 @@ def test_rows_that_are_taken_several_times_add_their_gradients() -> None:
 def test_runs_are_added_row_by_row(ids: list[int]) -> None:
     """As a GPU does it: in the order of the list, and without being asked how many there are of each."""
     values, rows = torch.rand(len(ids), 3), torch.tensor(ids, dtype=torch.int64)
-    assert torch.equal(runs_added(values, rows, 5), torch.zeros(5, 3).index_add_(0, rows, values))
+    assert torch.equal(sum_runs(values, rows, 5), torch.zeros(5, 3).index_add_(0, rows, values))

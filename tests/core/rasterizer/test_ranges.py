@@ -9,7 +9,7 @@ from raster_scenes import changed, errors_of, front_camera, leaves, random_splat
 from gsx.core.data.camera import look_at
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.rasterizer.intersections import capped, intersect_tiles
+from gsx.core.rasterizer.intersections import cap_tiles, intersect_tiles
 from gsx.core.rasterizer.projection import project
 
 
@@ -123,7 +123,7 @@ def test_capped_lists_are_the_fronts_of_the_lists(cap: int) -> None:
     rules = RasterSettings(cull="tight")
     screen = project(dense_splats(), front_camera(), rules)
     full = intersect_tiles(screen, front_camera(), rules)
-    cut = capped(full, cap)
+    cut = cap_tiles(full, cap)
     lists = [
         full.splats[a:b].tolist() for a, b in zip(full.starts[:-1].tolist(), full.starts[1:].tolist(), strict=True)
     ]
@@ -138,7 +138,7 @@ def test_capped_lists_are_the_fronts_of_the_lists(cap: int) -> None:
 def test_capped_pairs_are_found_by_splat_as_well(cap: int) -> None:
     rules = RasterSettings(cull="tight")
     screen = project(dense_splats(), front_camera(), rules)
-    cut = capped(intersect_tiles(screen, front_camera(), rules), cap)
+    cut = cap_tiles(intersect_tiles(screen, front_camera(), rules), cap)
     assert sorted(cut.slots.tolist()) == list(range(len(cut.splats)))
     by_splat = torch.empty_like(cut.splats)
     by_splat[cut.slots.long()] = cut.splats

@@ -21,7 +21,7 @@ from gsx.core.rasterizer import Rendering, rasterize
 from gsx.core.training.parameter_table import (
     gradients,
     named_parameters,
-    restored_table,
+    restore_table,
     table_tensors,
     zero_grad,
 )
@@ -193,7 +193,7 @@ class Judge:
     def learnt(self, *augmenters: Any, batch: int = 1, steps: int = 1, ssim_weight: float = 0.2) -> dict[str, Tensor]:
         """Statistics after so many steps over views 4, 1, 5, 0 that move nothing."""
         run = self.run
-        run.backbone.table = restored_table(
+        run.backbone.table = restore_table(
             run.backbone.table, {name: value.clone() for name, value in self.start.items()}
         )
         run.training = replace(run.training, batch=batch, ssim_weight=ssim_weight)

@@ -20,7 +20,7 @@ from gsx.core.training.parameter_table import (
     keep_rows,
     named_parameters,
     reset_column,
-    restored_table,
+    restore_table,
     second_moments,
     shared_colour,
     size_of,
@@ -264,7 +264,7 @@ def test_a_column_the_run_did_not_have_is_named() -> None:
     saved = table_tensors(table)
     table.columns["filter"] = torch.zeros(2)
     with pytest.raises(CheckpointError, match="holds no filter: it was trained with other options"):
-        restored_table(table, saved)
+        restore_table(table, saved)
 
 
 def test_statistics_follow_their_rows_and_new_rows_begin_with_0() -> None:
@@ -280,13 +280,13 @@ def test_statistics_that_were_saved_as_columns_are_found() -> None:
     table = ParameterTable({"flat": Parameter(torch.ones(2))}, {}, {"visits": torch.tensor([3.0, 4])})
     saved = {name.replace("statistics.", "columns."): value for name, value in table_tensors(table).items()}
     empty = ParameterTable({"flat": Parameter(torch.ones(5))}, {}, {"visits": torch.zeros(5)})
-    assert restored_table(empty, saved)["visits"].tolist() == [3, 4]
+    assert restore_table(empty, saved)["visits"].tolist() == [3, 4]
 
 
 def test_learning_rates_that_are_set_once_outlive_a_restart() -> None:
     table = ParameterTable({"flat": Parameter(torch.ones(2))})
     table.set_rate("flat", 0.5)
-    assert restored_table(table, table_tensors(table)).group("flat")["lr"] == 0.5
+    assert restore_table(table, table_tensors(table)).group("flat")["lr"] == 0.5
 
 
 def small_networks() -> Networks:
@@ -310,7 +310,7 @@ def test_networks_are_moved_saved_and_restored_with_the_rows() -> None:
         torch.testing.assert_close(
             before[name] - value.detach(), torch.full_like(value, 0.5 if name == "flat" else 0.25)
         )
-    again = restored_table(other, table_tensors(table))
+    again = restore_table(other, table_tensors(table))
     assert {name: value.tolist() for name, value in table_tensors(again).items()} == {
         name: value.tolist() for name, value in table_tensors(table).items()
     }
@@ -324,12 +324,12 @@ def test_what_networks_keep_beside_parameters_is_saved_and_restored() -> None:
     table, other = made(), made()
     table.networks.modules["colour"](torch.tensor([[1.0, 5], [3, 9]]))
     assert table.networks.modules["colour"][0].running_mean.tolist() == pytest.approx([0.2, 0.7])
-    found = table_tensors(restored_table(other, table_tensors(table)))
+    found = table_tensors(restore_table(other, table_tensors(table)))
     assert found["buffers.colour.0.running_mean"].tolist() == pytest.approx([0.2, 0.7])
     assert found["buffers.colour.0.num_batches_tracked"] == 1
     saved = {name: value for name, value in table_tensors(table).items() if not name.startswith("buffers.")}
     with pytest.raises(CheckpointError, match="holds no buffers"):
-        restored_table(made(), saved)
+        restore_table(made(), saved)
 
 
 def test_networks_that_share_weights_keep_them_as_parameters() -> None:
@@ -340,7 +340,7 @@ def test_networks_that_share_weights_keep_them_as_parameters() -> None:
 
     table = made()
     assert list(table.networks.buffers()) == []
-    found = table_tensors(restored_table(made(), table_tensors(table)))
+    found = table_tensors(restore_table(made(), table_tensors(table)))
     assert torch.equal(found["heads.colour.0.weight"], table_tensors(table)["heads.colour.0.weight"])
 
 
@@ -361,7 +361,7 @@ def test_what_is_recorded_later_comes_back() -> None:
     table = made()
     table.record |= {"first": torch.tensor(3.0), "budget": torch.tensor([4, 5])}
     del table.record["new"]  # of a later version, as far as the file knows
-    found = restored_table(made(), table_tensors(table)).record
+    found = restore_table(made(), table_tensors(table)).record
     assert {name: value.tolist() for name, value in found.items()} == {"first": 3, "budget": [4, 5], "new": [1]}
 
 

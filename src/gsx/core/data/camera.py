@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsx.core.device import uploaded
+from gsx.core.device import upload
 from gsx.core.errors import InputError
 from gsx.core.shapes import Bool, Float
 
@@ -71,7 +71,7 @@ class Camera:
     def to_camera(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
         """Transforms world points to camera coordinates, in float64: far from the origin float32 is too coarse."""
         points, double = points.double(), torch.float64
-        rotation, translation = (uploaded(x, points.device, double) for x in (self.rotation.T, self.translation))
+        rotation, translation = (upload(x, points.device, double) for x in (self.rotation.T, self.translation))
         return points @ rotation + translation
 
     @property
@@ -163,7 +163,7 @@ def offsets_from(points: Float[Tensor, "P 3"], centre: Float[Tensor, "3"]) -> Fl
 
     Rounding the centre first would move it by a float32 step of the coordinates (docs/explanation/numerics.md).
     """
-    return (points.double() - uploaded(centre, points.device, torch.float64)).to(points)
+    return (points.double() - upload(centre, points.device, torch.float64)).to(points)
 
 
 def look_at(

@@ -72,6 +72,6 @@ def where_counted(
     return image if counted is None else torch.where(counted.to(image.device), image, other)
 
 
-def blacked(image: Float[Tensor, "C H W"], counted: Bool[Tensor, "H W"] | None) -> Float[Tensor, "C H W"]:
+def black_out(image: Float[Tensor, "C H W"], counted: Bool[Tensor, "H W"] | None) -> Float[Tensor, "C H W"]:
     """Returns the image with masked pixels black."""
     return image if counted is None else torch.where(counted.to(image.device), image, 0)

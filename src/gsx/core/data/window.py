@@ -39,7 +39,7 @@ class Window:
         top, bottom = (
             (edge - camera.cy) / camera.fy * other.fy + other.cy for edge in (self.top, self.top + self.height)
         )
-        columns, rows = covered(left, right, other.width), covered(top, bottom, other.height)
+        columns, rows = overlapped(left, right, other.width), overlapped(top, bottom, other.height)
         return Window(columns.start, rows.start, len(columns), len(rows))
 
     def shares(self, width: int, height: int) -> tuple[float, float, float, float]:
@@ -67,7 +67,7 @@ ROUNDING = 1e-6
 """Tolerance of a window's edge from a pixel boundary, px."""
 
 
-def covered(begin: float, end: float, size: int) -> range:
+def overlapped(begin: float, end: float, size: int) -> range:
     """Returns the pixels, of `size` in a row, that overlap the interval."""
     first, last = math.floor(begin + ROUNDING), math.ceil(end - ROUNDING)
     return range(min(max(first, 0), size), min(max(last, 0), size))

@@ -18,7 +18,7 @@ def bag_sums(values: Float[Tensor, "E V"], places: Int[Tensor, "P"], edges: Int[
     return embedding_bag(places, values, edges[:-1].to(places), mode="sum")
 
 
-def runs_added(values: Float[Tensor, "M V"], ids: Int[Tensor, "M"], count: int) -> Float[Tensor, "N V"]:
+def sum_runs(values: Float[Tensor, "M V"], ids: Int[Tensor, "M"], count: int) -> Float[Tensor, "N V"]:
     """Sums the values of each id into a row; ids ascend. Does not wait for the device."""
     rows = torch.arange(count + 1, device=ids.device, dtype=ids.dtype)
     return bag_sums(values, torch.arange(len(ids), device=ids.device), torch.searchsorted(ids, rows))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsx.core.backend import EAGER
 from gsx.core.data.camera import Camera, Frame
-from gsx.core.device import uploaded
+from gsx.core.device import upload
 from gsx.core.errors import TooManyPairs
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.bags import bag_sums, edges_of
@@ -73,7 +73,7 @@ def raster_numbers(frame: Frame, size: tuple[int, int], grid: TileGrid, device: 
     numbers = [
         [-(-whole // WINDOW_TILE), at, at + extent, begin, begin + count] for whole, at, extent, begin, count in sides
     ]
-    return uploaded(torch.tensor(numbers, dtype=torch.int32), device)
+    return upload(torch.tensor(numbers, dtype=torch.int32), device)
 
 
 @torch.no_grad()
@@ -186,7 +186,7 @@ def refuse_too_many(counts: Int[Tensor, "N"], grid: TileGrid, settings: RasterSe
     return count
 
 
-def capped(every: TileIntersections, cap: int) -> TileIntersections:
+def cap_tiles(every: TileIntersections, cap: int) -> TileIntersections:
     """Keeps the first `cap` intersections of each tile, its nearest splats; 0: all.
 
     Radii are kept: a splat without tiles still counts as visible, as behind opaque ones.

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from gsx.core.backend import EAGER
 from gsx.core.data.camera import Camera, Frame
-from gsx.core.device import uploaded
+from gsx.core.device import upload
 from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer.bags import runs_added
+from gsx.core.rasterizer.bags import sum_runs
 from gsx.core.rasterizer.geometry import geometry
-from gsx.core.rasterizer.selection import chosen_rows, lens_of, selected, slope_bounds
+from gsx.core.rasterizer.selection import chosen_rows, lens_of, select_splats, slope_bounds
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
 
@@ -79,7 +79,7 @@ def drawable(splats: Splats, camera: Camera, settings: RasterSettings) -> Bool[T
     """Marks all splats except those that a render from this camera drops because of their values."""
     numbers = lens_of(camera, on_frame(intrinsics_of(camera, None), camera.frame), settings.dilation, settings)
     numbers = numbers.to(splats.means.device)
-    return selected(splats, camera.to_camera(splats.means), numbers, EAGER)[0]
+    return select_splats(splats, camera.to_camera(splats.means), numbers, EAGER)[0]
 
 
 def project(
@@ -96,10 +96,10 @@ def project(
     refuse_unusable(camera, own, settings.jacobian_margin)
     dilation, drawn = dilations_of(camera, intrinsics, settings)
     lens = lens_of(camera, on_frame(own, camera.frame), dilation, settings)
-    numbers = uploaded(lens, splats.means.device)
+    numbers = upload(lens, splats.means.device)
     points = camera.to_camera(splats.means)
     device = splats.means.device.type
-    good, visible = selected(splats, points, numbers, settings.backend.on(device) if len(splats) > 1 else EAGER)
+    good, visible = select_splats(splats, points, numbers, settings.backend.on(device) if len(splats) > 1 else EAGER)
     fields = (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
     ids, dropped = chosen_rows(good, visible)  # before any division
     points, scales, quats, log_opacities, channels = (take_rows(values, ids) for values in fields)
@@ -110,7 +110,7 @@ def project(
     backend = settings.backend.on(device, learning=True) if len(ids) > 1 else EAGER
     compute = backend.kernel(geometry, variant=(compensate, bool(drawn)))
     means, covariances, conic_factors, compensation = compute(
-        points, scales, quats, uploaded(camera.rotation, ids.device, scales.dtype), *shape, *rules
+        points, scales, quats, upload(camera.rotation, ids.device, scales.dtype), *shape, *rules
     )
     if drawn and compensation is not None:  # opacities stay at most alpha_max
         most = log_opacities.clamp_min(math.log(settings.alpha_max))
@@ -169,7 +169,7 @@ class RepeatRows(torch.autograd.Function):
         (ids,) = ctx.saved_tensors
         if gradient.device.type == "cpu":
             return gradient.new_zeros(ctx.shape).index_add_(0, ids, gradient), None
-        return runs_added(gradient.flatten(1), ids, ctx.shape[0]).view(ctx.shape), None
+        return sum_runs(gradient.flatten(1), ids, ctx.shape[0]).view(ctx.shape), None
 
 
 def repeat_rows(values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[Tensor, "M *rest"]:

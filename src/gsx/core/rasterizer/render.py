@@ -14,7 +14,7 @@ from gsx.core.errors import InputError, TooManyPairs
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.composite import composite_eager
 from gsx.core.rasterizer.grid import TileGrid
-from gsx.core.rasterizer.intersections import capped, intersect_tiles
+from gsx.core.rasterizer.intersections import cap_tiles, intersect_tiles
 from gsx.core.rasterizer.projection import ScreenSplats, project
 from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
 from gsx.core.shapes import Bool, Float, Int
@@ -111,7 +111,7 @@ def rasterize(
         TooManyPairs: there are more splat-tile pairs than `settings.max_pairs`.
     """
     screen = project(splats, camera, settings, intrinsics)
-    intersections = capped(intersect_tiles(screen, camera, settings), settings.tile_cap)
+    intersections = cap_tiles(intersect_tiles(screen, camera, settings), settings.tile_cap)
     learning = torch.is_grad_enabled() and any(value.requires_grad for value in vars(splats).values())
     statistics = ScreenStatistics.before_blending(screen, intersections.radii, camera.size, learning, absolute_gradient)
     channels = torch.cat([screen.channels, screen.depths[:, None]], 1) if depth else screen.channels

@@ -135,7 +135,7 @@ def select(
 
 
 @torch.no_grad()
-def selected(
+def select_splats(
     splats: Splats, points: Float[Tensor, "N 3"], numbers: Float[Tensor, "16"], backend: Backend
 ) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
     """Calls `select` on splats, with one compiled code also for those without colours and for strided fields."""

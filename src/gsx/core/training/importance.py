@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.masks import blacked
+from gsx.core.data.masks import black_out
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.gaussians.splats import Splats
@@ -129,7 +129,7 @@ def random_signs(
     image: Float[Tensor, "3 H W"], generator: torch.Generator, counted: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, "3 H W"]:
     """Draws 1 or -1 for each value of a picture; 0 where masked."""
-    return blacked(torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1, counted)
+    return black_out(torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1, counted)
 
 
 def draws_per_view(views: Sequence[View]) -> int:
@@ -205,7 +205,7 @@ class Probe:
         """Returns the corrected render minus the photo, or a window of it; 0 where masked."""
         part, counted = window or Window(0, 0, *view.camera.size), view.counted()
         photo = part.cut(view.image()).to(image)
-        return blacked(
+        return black_out(
             self.views.match_photo(image.detach(), photo, view, window) - photo,
             None if counted is None else counted[part.pixels],
         )

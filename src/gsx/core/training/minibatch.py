@@ -30,7 +30,7 @@ def rollback_on_error(run: Run) -> Iterator[None]:
 
 
 @contextmanager
-def gradients_added(table: ParameterTable) -> Iterator[None]:
+def accumulate_gradients(table: ParameterTable) -> Iterator[None]:
     """Clears gradients for the block, whose terms may drop some, and adds the earlier ones at its end."""
     before = gradients(table)
     zero_grad(table)

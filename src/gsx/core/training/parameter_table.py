@@ -206,13 +206,13 @@ def take_adam_step(table: ParameterTable) -> None:
     """Takes an Adam step, with learning rates times the table's pace, and clears the gradients."""
     networks = [] if table.networks is None else [table.networks.optimiser]
     for optimiser in [table.optimiser, *networks]:
-        with paced(optimiser, table.pace):
+        with scaled_rates(optimiser, table.pace):
             optimiser.step()
     zero_grad(table)
 
 
 @contextmanager
-def paced(optimiser: torch.optim.Optimizer, pace: float) -> Iterator[None]:
+def scaled_rates(optimiser: torch.optim.Optimizer, pace: float) -> Iterator[None]:
     """Multiplies the learning rates by `pace` inside the block."""
     rates = [group["lr"] for group in optimiser.param_groups]
     try:
@@ -233,7 +233,7 @@ def size_of(table: ParameterTable) -> tuple[int, int]:
 # -- checkpoints -------------------------------------------------------------------------------------------------------
 
 
-def learnt(table: ParameterTable) -> Iterator[tuple[str, str, Parameter, torch.optim.Adam]]:
+def learned_parameters(table: ParameterTable) -> Iterator[tuple[str, str, Parameter, torch.optim.Adam]]:
     """Yields (key in checkpoints, name, parameter, optimiser) of all learned parameters."""
     for name, parameter in table.parameters.items():
         yield f"parameters.{name}", name, parameter, table.optimiser
@@ -247,7 +247,7 @@ def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
     out = {f"columns.{name}": column for name, column in table.columns.items()}
     out |= {f"statistics.{name}": sums for name, sums in table.statistics.items()}
     out |= {f"{RECORD}{name}": entry for name, entry in table.record.items()}
-    for key, name, parameter, optimiser in learnt(table):
+    for key, name, parameter, optimiser in learned_parameters(table):
         out[key] = parameter.detach()
         out |= {f"adam.{name}.{entry}": value for entry, value in optimiser.state.get(parameter, {}).items()}
     if table.networks is not None:
@@ -255,7 +255,7 @@ def table_tensors(table: ParameterTable) -> dict[str, Tensor]:
     return out
 
 
-def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> ParameterTable:
+def restore_table(like: ParameterTable, tensors: dict[str, Tensor]) -> ParameterTable:
     """Restores the table of a checkpoint, with any number of rows, and learning rates and networks of `like`.
 
     Raises:
@@ -274,7 +274,7 @@ def restored_table(like: ParameterTable, tensors: dict[str, Tensor]) -> Paramete
     )
     for name in table.parameters:
         table.set_rate(name, like.group(name)["lr"])
-    for key, name, parameter, optimiser in learnt(table):
+    for key, name, parameter, optimiser in learned_parameters(table):
         parameter.data.copy_(saved(key, parameter.shape, tensors))
         restore_adam(name, parameter, optimiser, tensors)
     for name, buffer in table.networks.buffers() if table.networks is not None else ():

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsx.core.backend import Backend
 from gsx.core.data.scene import View
-from gsx.core.device import uploaded
+from gsx.core.device import upload
 from gsx.core.quality.losses import moments_of
 from gsx.core.shapes import Float, UInt8
 
@@ -49,7 +49,7 @@ class PhotoCache:
         """Returns `view.image()` on the device."""
         picture = self.kept.get(view)
         if picture is None:
-            picture = uploaded(view.picture(), self.device)
+            picture = upload(view.picture(), self.device)
             if picture.nbytes <= self.room:
                 self.kept[view], self.room = picture, self.room - picture.nbytes
         return picture.float() / 255.0

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.scene import Scene, View
-from gsx.core.device import uploaded
+from gsx.core.device import upload
 from gsx.core.errors import Stopped
 from gsx.core.options import without_effect
 from gsx.core.quality.metrics import psnr
@@ -119,7 +119,7 @@ class Run:
     @property
     def background(self) -> Float[Tensor, "3"]:
         """The scene's background on the run's device."""
-        return uploaded(self.scene.background, self.device)
+        return upload(self.scene.background, self.device)
 
     @property
     def modules(self) -> Modules:

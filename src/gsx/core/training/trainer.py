@@ -8,17 +8,17 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsx.core.data.masks import blacked
+from gsx.core.data.masks import black_out
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
-from gsx.core.device import uploaded
+from gsx.core.device import upload
 from gsx.core.errors import Stopped
 from gsx.core.plugins import Plugins
 from gsx.core.quality.losses import photometric
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.augmenter import accounts_of
 from gsx.core.training.backbone import Observation, Validating, remove_nonfinite
-from gsx.core.training.minibatch import gradients_added, merge_gradients, rollback_on_error
+from gsx.core.training.minibatch import accumulate_gradients, merge_gradients, rollback_on_error
 from gsx.core.training.parameter_table import zero_grad
 from gsx.core.training.pseudo_terms import backward_terms, request_terms, reusable_parts, reused_losses, without_windows
 from gsx.core.training.pseudo_views import Term
@@ -114,7 +114,7 @@ def backward(run: Run) -> StepResult:
     run.photos.set_views(views)
     for index, of_view, colour in zip(indices, terms, colours, strict=True):
         run.raise_if_stopping()
-        with gradients_added(run.backbone.table):
+        with accumulate_gradients(run.backbone.table):
             results.append(view_loss(run, step, views[index], of_view, colour))
     results[0] = replace(results[0], pseudo=accounts_of(run, step))
     return results[0] if len(batch) == 1 else merge_gradients(run, results)
@@ -128,7 +128,7 @@ def view_loss(run: Run, step: int, view: View, terms: Sequence[Term], colour: Fl
     """
     windows, observations = excluded_windows(run, view, step), list[Observation]()
     counted = counted_in_loss(view, windows)
-    target = blacked(run.photos.of(view), counted)
+    target = black_out(run.photos.of(view), counted)
     allowed = [without_windows(term, view.camera, windows) for term in terms]
     divided = [reusable_parts(term, view.camera, run.training.random_background) for term in allowed]
     parts = backward_terms(run, [term for term, _ in divided], step, observations)
@@ -137,7 +137,7 @@ def view_loss(run: Run, step: int, view: View, terms: Sequence[Term], colour: Fl
     backend = run.raster.backend.on(run.device.type, learning=True)
     matched = run.views.match_photo(rendering.image, target, view, learning=True)
     moments = run.photos.moments_of(view, target, backend) if counted is None else None
-    loss = photometric(blacked(matched, counted), target, run.training.ssim_weight, backend, moments)
+    loss = photometric(black_out(matched, counted), target, run.training.ssim_weight, backend, moments)
     extra = run.backbone.regulariser(drawn)
     if extra is not None:
         loss = loss + extra
@@ -184,5 +184,5 @@ def counted_in_loss(view: View, windows: Sequence[Window]) -> Bool[Tensor, "H W"
 def background(run: Run) -> Float[Tensor, "3"]:
     """Returns the scene's background, or a new random colour."""
     if run.training.random_background:
-        return uploaded(torch.rand(3, generator=run.generator), run.device)
+        return upload(torch.rand(3, generator=run.generator), run.device)
     return run.background

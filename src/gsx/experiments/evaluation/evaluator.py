@@ -14,7 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from gsx.core.data.masks import blacked
+from gsx.core.data.masks import black_out
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.quality.metrics import bicubic, psnr, quantise, ssim
@@ -124,8 +124,8 @@ class Evaluator:
         whole, counted = self.measured(self.renders.fit(view, tiled.image)), view.counted()
         self.kept[view] = to_uint8(whole) if self.options.quantise else whole
         image, truth, judged = (
-            blacked(whole, counted),
-            blacked(view.image(), counted),
+            black_out(whole, counted),
+            black_out(view.image(), counted),
             self.renders.evaluated_pixels(view, counted),
         )
         return {
@@ -164,10 +164,10 @@ class Evaluator:
         return Zoomed(
             view=finer,
             factor=factor,
-            truth=blacked(finer.image(), counted),
-            render=blacked(self.measured(image), counted),
-            enlarged=blacked(self.measured(enlarged), counted),
-            photograph=blacked(self.measured(photograph), counted),
+            truth=black_out(finer.image(), counted),
+            render=black_out(self.measured(image), counted),
+            enlarged=black_out(self.measured(enlarged), counted),
+            photograph=black_out(self.measured(photograph), counted),
             counted=self.renders.evaluated_pixels(finer, counted),
         )
 

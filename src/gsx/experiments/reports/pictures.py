@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from gsx.core.data.images import write_image
-from gsx.core.data.masks import blacked, grown
+from gsx.core.data.masks import black_out, grown
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.files import write_json
@@ -86,7 +86,7 @@ class Pictures:
     def compared(self, name: str, view: View, render: Float[Tensor, "3 H W"]) -> dict[str, str]:
         """Writes truth, render and error of a view; returns their files by kind."""
         truth = view.image()
-        error = error_map(*(blacked(picture, view.counted()) for picture in (render, truth)))
+        error = error_map(*(black_out(picture, view.counted()) for picture in (render, truth)))
         images = {"truth": truth, "render": render, "error": error}
         return {kind: self.save(f"{name}.{kind}", reduced(image)) for kind, image in images.items()}
 

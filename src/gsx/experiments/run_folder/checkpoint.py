@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, refuse_lfs_pointer, replace_file, sidecars, step_of, write_json
-from gsx.core.training.parameter_table import restored_table, table_tensors
+from gsx.core.training.parameter_table import restore_table, table_tensors
 from gsx.core.training.run import Run
 
 logger = logging.getLogger(__name__)
@@ -181,7 +181,7 @@ def restore(run: Run, training: bool = False) -> None:
         raise CheckpointError(f"a checkpoint of {run.folder} has no random numbers to go on with ({error})") from error
     for prefix, module in run.modules.items():
         module.load_state_dict(taken_out(tensors, f"{prefix}."))
-    run.backbone.table = restored_table(run.backbone.table, tensors)
+    run.backbone.table = restore_table(run.backbone.table, tensors)
     run.step, run.progress.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])
     run.sampler.orders = meta.get("orders", -(-run.step // run.sampler.count))  # gsx before orders were counted

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.core.data.masks import blacked
+from gsx.core.data.masks import black_out
 from gsx.core.data.scene import View
 from gsx.core.files import write_json
 from gsx.core.plugins import Plugins
@@ -94,7 +94,7 @@ def finding(run: Run, view: View, known_sharpness: float | None, pixels: int) ->
     """Compares one photograph with the render; without remarks."""
     own, photograph, counted = render(run, view.camera, pixels).image, view.image(), view.counted()
     image = at_exposure(run, view, own)
-    error = blacked(image - photograph, counted).square().mean(0)
+    error = black_out(image - photograph, counted).square().mean(0)
     return Finding(
         name=view.name,
         psnr=psnr(image, photograph, counted),
