@@ -1,1 +1,1 @@
-"""Trackers that come with gsx. Their packages are optional, and imported only when a tracker is chosen."""
+"""Built-in trackers. Their packages are optional, and imported only if the tracker is chosen."""

@@ -1,22 +1,22 @@
-"""Numbers of a run by name, as trackers keep them."""
+"""Metrics of a run by name, for trackers."""
 
 from typing import Any
 
 
 def numbers(content: dict[str, Any], prefix: str = "") -> dict[str, float]:
-    """Selects the numbers directly in a mapping, also those that are not finite, with `prefix` before their key."""
+    """Returns the numbers directly in a mapping, finite or not, with `prefix` before their key."""
     kept = {key: value for key, value in content.items() if isinstance(value, int | float)}
     return {f"{prefix}{key}": float(value) for key, value in kept.items() if not isinstance(value, bool)}
 
 
 def line_figures(line: dict[str, Any]) -> dict[str, float]:
-    """Selects the numbers of a line of metrics.jsonl except its step; parts of the loss are `terms/NAME`."""
+    """Returns the numbers of a line of metrics.jsonl without its step; parts of the loss are `terms/NAME`."""
     figures = numbers(line) | numbers(line.get("terms", {}), "terms/")
     return {name: value for name, value in figures.items() if name != "step"}
 
 
 def evaluation_figures(evaluation: dict[str, Any]) -> dict[str, float]:
-    """Selects the numbers of evaluation.json except its step: `evaluation/psnr`, and by zoom `evaluation/x2/psnr`."""
+    """Returns the numbers of evaluation.json without its step: `evaluation/psnr`, by zoom `evaluation/x2/psnr`."""
     figures = numbers(evaluation, "evaluation/")
     for factor, result in evaluation.get("zoom", {}).items():
         figures |= numbers(result, f"evaluation/x{factor}/")

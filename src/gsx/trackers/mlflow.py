@@ -25,25 +25,25 @@ from gsx.trackers.figures import evaluation_figures, line_figures
 
 logger = logging.getLogger(__name__)
 
-KEPT = "mlflow.json"
-"""File in the run folder: the store and MLflow's id of the run."""
+STATE = "mlflow.json"
+"""File in the run folder with the store and MLflow's id of the run."""
 SQLITE = "sqlite:///"
 PACKAGES = ("mlflow", "sqlalchemy", "alembic")
-PARAMETERS_AT_ONCE, METRICS_AT_ONCE = 100, 1000
-"""Limits of MLflow for one request."""
+MOST_PARAMETERS, MOST_METRICS = 100, 1000
+"""MLflow's limits of one request."""
 LONGEST_VALUE, LONGEST_KEY = 500, 250
-"""Characters of a parameter that every version of a server takes."""
+"""Characters of a parameter that all server versions accept."""
 DEFAULTS = {
-    "MLFLOW_CONFIGURE_LOGGING": "false",  # hides its lines about tables and migrations, not its warnings
+    "MLFLOW_CONFIGURE_LOGGING": "false",  # hides lines about tables and migrations, not warnings
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",  # standard output is for the report's path
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",  # 7 would delay training by minutes when a server is down
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",  # seconds, of 120
 }
-"""Settings of MLflow where the user's environment has none."""
+"""Environment variables of MLflow, unless the user has set them."""
 SECRET = re.compile(
     "pass(?!file)|pwd|token|secret|(api|access)_?key|credential|signature|^(key|auth|sig)$", re.IGNORECASE
 )
-"""Names of secrets."""
+"""Names of secrets in URIs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,21 +54,20 @@ class MLflowOptions:
     uri: str
     """MLflow's tracking URI; empty: `mlflow.db` in the output folder."""
     experiment: str
-    """Experiment that runs are listed under; empty: the scene's name."""
+    """Name of the experiment; empty: the scene's name."""
     seconds: Seconds
-    """Least time between requests during training."""
+    """Least time between requests during training, s."""
 
     def __post_init__(self) -> None:
-        if holds_secret(self.uri):  # config.yaml, report and logs would show it
+        if holds_secret(self.uri):  # it would be in config.yaml, report and logs
             raise ValueError(
-                "tracker.mlflow.uri holds a password or token; leave it out: for a server set MLFLOW_TRACKING_USERNAME "
-                "and MLFLOW_TRACKING_PASSWORD, or MLFLOW_TRACKING_TOKEN, for a database use its own means, such as "
-                "PGPASSWORD"
+                "tracker.mlflow.uri holds a password or token. Remove it: set MLFLOW_TRACKING_USERNAME and "
+                "MLFLOW_TRACKING_PASSWORD, or MLFLOW_TRACKING_TOKEN, or for a database a variable such as PGPASSWORD"
             )
 
 
 def holds_secret(uri: str) -> bool:
-    """Finds a password or token in an address; a user's name is one where servers may take a token for it."""
+    """Returns whether a URI has a password or token; on web servers a user's name may be a token."""
     try:
         parts = urlsplit(uri)
     except ValueError:
@@ -80,14 +79,14 @@ def holds_secret(uri: str) -> bool:
 
 
 class MLflow:
-    """Listener: keeps a run of MLflow.
+    """Tracker that records a run in MLflow.
 
     Raises:
         ConfigError: a package is not installed, or MLflow cannot use the URI.
     """
 
     def __init__(self, options: MLflowOptions) -> None:
-        os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"  # it would report its use over the network
+        os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"  # no usage reports over the network
         for name, value in DEFAULTS.items():
             os.environ.setdefault(name, value)
         require("tracker mlflow", PACKAGES, "gsx[mlflow]")
@@ -98,66 +97,66 @@ class MLflow:
 
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
-        """Begins a run of MLflow, or goes on with the one that this run had before."""
-        kept = read_json(run.folder / KEPT) if (run.folder / KEPT).is_file() else {}
-        uri = self.options.uri or kept.get("uri") or own_store(run)
+        """Creates MLflow's run, or resumes the one of this run folder."""
+        state = read_json(run.folder / STATE) if (run.folder / STATE).is_file() else {}
+        uri = self.options.uri or state.get("uri") or default_store(run)
         self.client = self.client or client_of(uri)
-        if kept.get("uri") == uri:
-            self.go_on(kept["run"])
+        if state.get("uri") == uri:
+            self.resume(state["run"])
         else:
-            self.begin(run, uri)
+            self.create(run, uri)
         self.send(run)
         logger.info("tracker mlflow: run %s at %s", self.run_id, uri)
 
-    def go_on(self, run_id: str) -> None:
-        """Continues after the last step that MLflow has, since it keeps all points and repeated steps are the same."""
+    def resume(self, run_id: str) -> None:
+        """Continues after the last step in MLflow, which keeps duplicates."""
         self.run_id = run_id
         self.client.update_run(run_id, status="RUNNING")
         self.sent_step = max((point.step for point in self.client.get_metric_history(run_id, "loss")), default=0)
 
-    def begin(self, run: Run, uri: str) -> None:
-        """Creates a run with its parameters."""
+    def create(self, run: Run, uri: str) -> None:
+        """Creates MLflow's run with its parameters."""
         experiment = experiment_id(self.client, uri, self.options.experiment or run.scene.name)
         tags = {"gsx.folder": str(run.folder.resolve()), "gsx.device": device_name(run.device)}
         self.run_id = self.client.create_run(experiment, tags=tags, run_name=run.folder.name).info.run_id
-        write_json(run.folder / KEPT, {"uri": uri, "run": self.run_id})
-        for some in portions(parameters(run.config), PARAMETERS_AT_ONCE):
-            self.client.log_batch(self.run_id, params=some)
+        write_json(run.folder / STATE, {"uri": uri, "run": self.run_id})
+        for part in chunks(parameters(run.config), MOST_PARAMETERS):
+            self.client.log_batch(self.run_id, params=part)
 
     @hookimpl
     def gsx_step_finished(self, run: Run) -> None:
-        """Sends new lines when it is time."""
+        """Sends new lines, at most every `seconds`."""
         if time.monotonic() - self.sent_at >= self.options.seconds:
             self.send(run)
 
     @hookimpl
     def gsx_training_finished(self, run: Run) -> None:
-        """Sends the rest and marks an interrupted run as killed."""
+        """Sends the rest, and marks an interrupted run as killed."""
         self.send(run)
         if not run.complete:
             self.client.set_terminated(self.run_id, "KILLED")
 
     @hookimpl
     def gsx_evaluated(self, evaluation: dict[str, Any]) -> None:
-        """Sends the figures."""
+        """Sends the metrics."""
         self.log(metrics(evaluation_figures(evaluation), evaluation["step"]))
 
     @hookimpl
     def gsx_run_finished(self, run: Run) -> None:
-        """Sends files and marks the run as finished."""
+        """Sends files, and marks the run as finished."""
         for name in ("config.yaml", "evaluation.json", "report.html"):
             self.client.log_artifact(self.run_id, str(run.folder / name))
         self.client.set_terminated(self.run_id, "FINISHED")
 
     @hookimpl
     def gsx_run_failed(self, run: Run, reason: str) -> None:
-        """Sends the rest and marks the run as failed, or as killed after Ctrl-C."""
+        """Sends the rest, and marks the run as failed, or as killed after Ctrl-C."""
         self.send(run)
         self.client.set_tag(self.run_id, "gsx.reason", reason[:LONGEST_VALUE])
         self.client.set_terminated(self.run_id, "KILLED" if reason.startswith("KeyboardInterrupt") else "FAILED")
 
     def send(self, run: Run) -> None:
-        """Sends the lines of metrics.jsonl that MLflow lacks."""
+        """Sends the lines of metrics.jsonl after the last sent step."""
         lines = [line for line in run.progress.curves if line["step"] > self.sent_step]
         self.log([metric for line in lines for metric in metrics(line_figures(line), int(line["step"]))])
         self.sent_step = max([self.sent_step, *(int(line["step"]) for line in lines)])
@@ -165,25 +164,21 @@ class MLflow:
 
     def log(self, points: Sequence[Any]) -> None:
         """Sends metrics."""
-        for some in portions(points, METRICS_AT_ONCE):
-            self.client.log_batch(self.run_id, metrics=some)
+        for part in chunks(points, MOST_METRICS):
+            self.client.log_batch(self.run_id, metrics=part)
 
 
 def checked_client(uri: str) -> Any:
-    """Makes a client for the user's URI without a request to a server.
-
-    Raises:
-        ConfigError: MLflow cannot use it.
-    """
+    """Returns a client for the user's URI, without a request to a server; ConfigError: MLflow cannot use it."""
     try:
         return client_of(uri)
-    except Exception as error:  # MLflow's own, SQLAlchemy's, the system's
+    except Exception as error:  # of MLflow, SQLAlchemy or the system
         remedy = "give sqlite:///FILE, http://HOST:PORT, or nothing for mlflow.db in the output folder"
         raise ConfigError(f"MLflow cannot use tracker.mlflow.uri={uri} ({first_line(error)}): {remedy}") from error
 
 
 def client_of(uri: str) -> Any:
-    """Makes MLflow's client; runs that begin together make the tables of a database one after the other."""
+    """Returns MLflow's client; a lock serialises the creation of a database's tables."""
     from mlflow import MlflowClient
 
     if not uri.startswith(SQLITE):
@@ -193,7 +188,7 @@ def client_of(uri: str) -> Any:
     with FileLock(folder / ".mlflow.lock"):
         client = MlflowClient(uri)
     quoted = Path(uri.removeprefix(SQLITE)).parent
-    if quoted != folder:  # MLflow makes that folder as well, and leaves it empty
+    if quoted != folder:  # MLflow also creates this folder, and leaves it empty
         with suppress(OSError):
             quoted.rmdir()
     return client
@@ -204,8 +199,8 @@ def folder_of(uri: str) -> Path:
     return Path(unquote(uri.removeprefix(SQLITE))).parent
 
 
-def own_store(run: Run) -> str:
-    """Returns the URI of the database in the output folder, with ? and % escaped."""
+def default_store(run: Run) -> str:
+    """Returns the URI of a database in the output folder, with ? and % escaped."""
     file = str(Path(run.config["output"]).resolve() / "mlflow.db")
     return SQLITE + file.replace("%", "%25").replace("?", "%3F")
 
@@ -214,7 +209,7 @@ def experiment_id(client: Any, uri: str, name: str) -> str:
     """Returns the id of an experiment; creates it if needed, with its files in the database's folder."""
     from mlflow.exceptions import MlflowException
 
-    local = uri.startswith(SQLITE)  # MLflow's own choice is the current folder
+    local = uri.startswith(SQLITE)  # MLflow's default is the current folder
     files = (folder_of(uri).resolve() / "mlflow_files" / name).as_uri() if local else None
     try:
         return str(client.create_experiment(name, artifact_location=files))
@@ -225,7 +220,7 @@ def experiment_id(client: Any, uri: str, name: str) -> str:
 
 
 def parameters(config: dict[str, Any]) -> list[Any]:
-    """Converts the configuration without trackers, whose addresses may hold passwords, to MLflow's parameters."""
+    """Converts the configuration to MLflow's parameters, without trackers, whose URIs may hold passwords."""
     from mlflow.entities import Param
 
     values = flattened({key: value for key, value in config.items() if key != "tracker"})
@@ -234,13 +229,13 @@ def parameters(config: dict[str, Any]) -> list[Any]:
 
 
 def metrics(figures: dict[str, float], step: int) -> list[Any]:
-    """Converts figures of a step to MLflow's metrics of this moment."""
+    """Converts numbers of a step to MLflow's metrics, with the current time."""
     from mlflow.entities import Metric
 
     now = int(time.time() * 1000)
     return [Metric(name, value, now, step) for name, value in figures.items()]
 
 
-def portions(items: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
-    """Yields the items, up to `size` at a time."""
+def chunks(items: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
+    """Yields the items in lists of at most `size`."""
     return (items[begin : begin + size] for begin in range(0, len(items), size))

@@ -1,4 +1,4 @@
-"""TensorBoard: lines of metrics.jsonl as curves, figures of the evaluation, test pictures and the configuration."""
+"""TensorBoard: curves of metrics.jsonl, evaluation, test pictures and configuration."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +19,13 @@ class TensorBoardOptions:
 
     name: str
     folder: str
-    """Folder with one inside for each run; empty: `tensorboard` in the run folder."""
+    """Folder with a subfolder per run; empty: `tensorboard` in the run folder."""
     pictures: Annotated[int, Range(0, 10**6)]
-    """Test views, each with its truth, that are written when the run is evaluated."""
+    """Number of test views written at an evaluation, with render and truth."""
 
 
 class TensorBoard:
-    """Listener: writes event files.
+    """Tracker that writes event files.
 
     Raises:
         ConfigError: tensorboard is not installed.
@@ -39,7 +39,7 @@ class TensorBoard:
 
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
-        """Opens an event file that hides what earlier ones hold after the checkpoint."""
+        """Opens an event file that replaces later steps of earlier files."""
         from torch.utils.tensorboard import SummaryWriter
 
         folder = events_folder(run, self.options.folder)
@@ -62,7 +62,7 @@ class TensorBoard:
 
     @hookimpl
     def gsx_evaluated(self, run: Run, evaluation: dict[str, Any]) -> None:
-        """Writes figures and pictures."""
+        """Writes metrics and pictures."""
         for tag, value in evaluation_figures(evaluation).items():
             self.writer.add_scalar(tag, value, evaluation["step"])
         for tag, path in pictures(run.folder / "renders", self.options.pictures).items():
@@ -80,7 +80,7 @@ class TensorBoard:
         self.writer.close()
 
     def send(self, run: Run) -> None:
-        """Writes new lines to the disk at once: what a checkpoint covers must be there when a run goes on."""
+        """Writes new lines to the disk at once, since a resumed run needs those before its checkpoint."""
         lines = run.progress.curves[self.sent :]
         for line in lines:
             for tag, value in line_figures(line).items():
@@ -91,7 +91,7 @@ class TensorBoard:
 
 
 def events_folder(run: Run, folder: str) -> Path:
-    """Returns the folder of a run's event files; its path below `folder` is that below `output`."""
+    """Returns the folder of a run's event files, with the same path below `folder` as below `output`."""
     if not folder:
         return run.folder / "tensorboard"
     place, output = run.folder.resolve(), Path(run.config["output"]).resolve()
@@ -99,7 +99,7 @@ def events_folder(run: Run, folder: str) -> Path:
 
 
 def pictures(renders: Path, count: int) -> dict[str, Path]:
-    """Finds the pictures of the first `count` drawn test views, by tag."""
+    """Returns the pictures of the first `count` test views, by tag."""
     views = read_json(renders / "index.json")["views"][:count]
     return {
         f"{view['name']}/{kind}": renders / Path(view["files"][kind]).name
@@ -109,5 +109,5 @@ def pictures(renders: Path, count: int) -> dict[str, Path]:
 
 
 def indented(text: str) -> str:
-    """Indents a text so that Markdown leaves it as it is."""
+    """Indents a text, so that Markdown shows it as code."""
     return "".join(f"    {line}\n" for line in text.splitlines())
