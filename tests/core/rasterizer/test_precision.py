@@ -18,7 +18,7 @@ from raster_scenes import (
 )
 
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.rasterizer.composite import composite, make_blocks
+from gsx.core.rasterizer.composite import Composite, make_blocks
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import intersect_tiles
 from gsx.core.rasterizer.projection import project
@@ -67,7 +67,8 @@ def blended(screen, dtype: torch.dtype, rules: RasterSettings) -> torch.Tensor:
     camera = front_camera()
     values = (screen.means, screen.conic_factors, screen.log_opacities, screen.channels)
     blocks = make_blocks(intersect_tiles(screen, camera, rules), rules.chunk, len(screen.ids))
-    return composite(*(v.to(dtype) for v in values), blocks, TileGrid.of(camera, rules.tile_size), rules)
+    grid = TileGrid.of(camera, rules.tile_size)
+    return Composite.apply(*(v.to(dtype) for v in values), None, blocks, grid, rules, None)
 
 
 def test_float64_work_on_float32_splats_leaves_only_the_rounding_of_the_result() -> None:

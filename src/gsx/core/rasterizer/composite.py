@@ -279,7 +279,11 @@ def sum_by_splat(values: Float[Tensor, "E V"], splats: Int[Tensor, "E"], count: 
 
 
 class Composite(torch.autograd.Function):
-    """Autograd function of `composite`."""
+    """Autograd function of blended channels, then coverage (the sum of weights), on the raster of `grid`.
+
+    `absgrad`: leaf of zeros whose gradient becomes, per axis, the sum over pixels of the absolute gradient of the mean,
+    px; None: not computed. `max_weights` receives each list entry's largest blending weight, unless it is None.
+    """
 
     @staticmethod
     def forward(ctx, means, conic_factors, log_opacities, channels, absgrad, blocks, grid, settings, max_weights):
@@ -304,26 +308,6 @@ class Composite(torch.autograd.Function):
         return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], absgrad, None, None, None, None)
 
 
-def composite(
-    means: Float[Tensor, "M 2"],
-    conic_factors: Float[Tensor, "M 3"],
-    log_opacities: Float[Tensor, "M"],
-    channels: Float[Tensor, "M C"],
-    blocks: Blocks,
-    grid: TileGrid,
-    settings: RasterSettings,
-    *,
-    absgrad: Float[Tensor, "M 2"] | None = None,
-    max_weights: Float[Tensor, "S K"] | None = None,
-) -> Float[Tensor, "C_plus_1 H W"]:
-    """Returns blended channels, then coverage (the sum of weights), on the raster of `grid`.
-
-    `absgrad` is a leaf of zeros whose gradient becomes, per axis, the sum over pixels of the absolute gradient of the
-    mean (px). `max_weights` receives the largest blending weight of each list entry.
-    """
-    return Composite.apply(means, conic_factors, log_opacities, channels, absgrad, blocks, grid, settings, max_weights)
-
-
 def composite_eager(
     screen: ScreenSplats,
     channels: Float[Tensor, "M C"],
@@ -334,8 +318,8 @@ def composite_eager(
     """Blends in eager torch; a `Compositor`."""
     blocks = make_blocks(intersections, settings.chunk, len(screen.ids))
     by_entry = screen.means.new_zeros(blocks.splats.shape) if screen.weigh else None
-    inputs = (screen.means, screen.conic_factors, screen.log_opacities, channels)
-    blended = composite(*inputs, blocks, grid, settings, absgrad=screen.absgrad, max_weights=by_entry)
+    inputs = (screen.means, screen.conic_factors, screen.log_opacities, channels, screen.absgrad)
+    blended = Composite.apply(*inputs, blocks, grid, settings, by_entry)
     if by_entry is None:
         return blended, None
     zeros = by_entry.new_zeros(len(screen.ids) + 1)
