@@ -78,5 +78,5 @@ def test_a_picture_that_is_not_its_camera_s_is_refused_by_name(
 ) -> None:
     view = small_scene(torch.zeros(5, 3)).train[1]
     assert view.image().mean() == pytest.approx(128 / 255)
-    with pytest.raises(InputError, match=r"view 'view1' is torch.* and its camera takes torch.uint8 \[3, 16, 24\]"):
+    with pytest.raises(InputError, match=r"view 'view1' is torch.* but its camera needs torch.uint8 \[3, 16, 24\]"):
         View(view.name, view.camera, Odd(change)).image()

@@ -71,7 +71,7 @@ def refuse_unusable(camera: Camera, intrinsics: Float[Tensor, "4"], margin: floa
         )
     if not bool(torch.isfinite(camera.rotation).all() & torch.isfinite(camera.translation).all()):
         pose = f"rotation {camera.rotation.tolist()}, translation {camera.translation.tolist()}"
-        raise InputError(f"the pose of a camera is not finite: {pose}")
+        raise InputError(f"the pose of a camera is not finite ({pose}): correct it")
 
 
 @torch.no_grad()

@@ -293,7 +293,7 @@ def restore_adam(name: str, parameter: Parameter, optimiser: torch.optim.Adam, t
 def saved(key: str, shape: torch.Size, tensors: dict[str, Tensor]) -> Tensor:
     """Returns a tensor of a checkpoint; CheckpointError: there is none of that shape."""
     if key not in tensors or tensors[key].shape != shape:
-        raise CheckpointError(f"the checkpoint has no {key} of shape {list(shape)}: remove it to use an older one")
+        raise CheckpointError(f"the checkpoint holds no {key} of shape {list(shape)}: remove it to use an older one")
     return tensors[key]
 
 
@@ -304,7 +304,7 @@ def saved_rows(kind: str, like: dict[str, Tensor], tensors: dict[str, Tensor]) -
     missing = [name for name, key in names.items() if not key]
     if missing:
         raise CheckpointError(
-            f"the checkpoint has no {' and no '.join(missing)}: it was trained with other options of the backbone; "
+            f"the checkpoint holds no {' and no '.join(missing)}: it was trained with other options of the backbone; "
             "resume with those, or train anew"
         )
     return {name: tensors[key] for name, key in names.items()}
