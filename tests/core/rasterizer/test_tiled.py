@@ -11,7 +11,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
-from gsx.core.rasterizer import Rendering, rasterize, rasterize_tiled, tiled
+from gsx.core.rasterizer import Rendering, rasterize, rasterize_tiled
 from gsx.core.rasterizer.render import covering
 from gsx.engine.compiled import available
 
@@ -65,7 +65,7 @@ def test_pieces_that_a_gpu_cannot_hold_are_halved_until_it_can(monkeypatch: pyte
 
     sizes = list[int]()
     whole = rasterize(random_splats(), front_camera(), any_path()).image
-    monkeypatch.setattr(tiled, "rasterize", holds_little)
+    monkeypatch.setattr("gsx.core.rasterizer.render.rasterize", holds_little)
     assert torch.equal(rasterize_tiled(random_splats(), front_camera(), any_path()).image, whole)
     assert sizes[0] == 70 * 52
 
