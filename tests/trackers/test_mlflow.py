@@ -20,7 +20,7 @@ from gsx.core.training.run import Run
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
 from gsx.trackers.figures import evaluation_figures, line_figures
-from gsx.trackers.mlflow import MLflow, MLflowOptions, client_of, experiment_id, own_store, parameters, portions
+from gsx.trackers.mlflow import MLflow, MLflowOptions, chunks, client_of, default_store, experiment_id, parameters
 
 RUN = ("iterations=12", "scene.points=100", "scene.train_views=3", "training.checkpoint_every=4",
        "training.log_every=2", "tracker=[mlflow]", "tracker.mlflow.seconds=0")  # fmt: skip
@@ -86,7 +86,7 @@ def test_metrics_are_those_of_the_files(finished: Path) -> None:
 @pytest.mark.parametrize("name", ["what?", "100%25"])
 def test_its_own_database_lies_in_the_output_folder_whatever_that_is_called(tmp_path: Path, name: str) -> None:
     run: Any = SimpleNamespace(config={"output": str(tmp_path / name)})
-    experiment = experiment_id(client_of(own_store(run)), own_store(run), "demo")
+    experiment = experiment_id(client_of(default_store(run)), default_store(run), "demo")
     assert experiment
     assert sorted(path.name for path in tmp_path.iterdir()) == [name]
     assert (tmp_path / name / "mlflow.db").is_file()
@@ -222,8 +222,8 @@ def test_parameters_are_what_mlflow_accepts() -> None:
 
 
 def test_portions_hold_everything_once() -> None:
-    assert [list(some) for some in portions(range(5), 2)] == [[0, 1], [2, 3], [4]]
-    assert list(portions([], 2)) == []
+    assert [list(some) for some in chunks(range(5), 2)] == [[0, 1], [2, 3], [4]]
+    assert list(chunks([], 2)) == []
 
 
 def test_the_environment_of_the_user_is_respected_but_for_telemetry(monkeypatch: pytest.MonkeyPatch) -> None:
