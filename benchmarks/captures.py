@@ -28,7 +28,7 @@ from typing import Any
 from gsx.builtin import plugins
 from gsx.core.files import read_json
 from gsx.experiments.runs.degraded import choose, pair_of
-from gsx.experiments.runs.photographs import judge_photographs
+from gsx.experiments.runs.photo_check import check_photos
 from measuring.wrong_models import wrong_model
 from zoom import (
     SUBJECTS,
@@ -209,7 +209,7 @@ def named(scene: str, seed: int, fault: str, given: argparse.Namespace) -> dict[
     steps, (word, _) = round(given.share * steps_among(SUBJECTS[scene])), FAULTS[fault]
     disturbances = [word, f"scene.disturb.some={FEW}"] if word else []
     folder = trained(scene, seed, given, [*OWN, *disturbances, f"iterations={steps}"], f"fault {fault}")
-    judge_photographs(folder, plugins(), worst=10)
+    check_photos(folder, plugins(), worst=10)
     found = read_json(folder / "photographs" / "index.json")["views"]
     bad = choose([view["name"] for view in found], FEW) if word else set()
     by_name = {view["name"]: view["remarks"] for view in found}

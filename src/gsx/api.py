@@ -36,10 +36,10 @@ from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import evaluate_again
 from gsx.experiments.runs.export import export, refuse_export
 from gsx.experiments.runs.job import train as train_job
-from gsx.experiments.runs.messages import set_up_logging as show_messages
+from gsx.experiments.runs.logs import set_up_logging as show_messages
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.overrides import is_override, quoted
-from gsx.experiments.runs.render import view_named
+from gsx.experiments.runs.render_views import view_named
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.tables.sweep import is_table

@@ -16,7 +16,7 @@ PLACES = ("output", "folder", "reuse")
 """What says where a run is trained."""
 
 
-def refuse_taken(verb: str, overrides: Sequence[str], remedies: Mapping[str, str]) -> None:
+def refuse_overrides(verb: str, overrides: Sequence[str], remedies: Mapping[str, str]) -> None:
     """Raises ConfigError for an override of what a verb's own flags say; `remedies` by key."""
     for word in overrides:
         if remedy := remedies.get(word.lstrip("+~").partition("=")[0]):

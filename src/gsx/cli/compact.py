@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import PLACES, Parser, positive, refuse_beyond, refuse_taken, whole
+from gsx.cli.arguments import PLACES, Parser, positive, refuse_beyond, refuse_overrides, whole
 from gsx.core.errors import InputError
 from gsx.core.ranges import MOST_STEPS, Range
 from gsx.engine.collector import loading
@@ -33,7 +33,9 @@ def verb_compact(arguments: list[str]) -> int:
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="new run folder (RUN_compact)")
     given = parser.parse_intermixed_args(arguments)
     refuse_beyond("gsx compact --steps", given.steps or 0, Range(0, MOST_STEPS))
-    refuse_taken("gsx compact", given.overrides, dict.fromkeys(PLACES, "--to FOLDER says where the smaller run goes"))
+    refuse_overrides(
+        "gsx compact", given.overrides, dict.fromkeys(PLACES, "--to FOLDER says where the smaller run goes")
+    )
     if not given.target.exists():
         raise InputError(f"'{given.target}' does not exist: give a run folder or a splat file")
     with loading():

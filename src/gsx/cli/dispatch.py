@@ -7,14 +7,14 @@ from collections.abc import Callable, Sequence
 from gsx import __version__
 from gsx.cli.arguments import RESUME_FLAGS
 from gsx.cli.compact import verb_compact
+from gsx.cli.exit_codes import discard_unwritten, explained, unheard
 from gsx.cli.folder import is_given, train_from
 from gsx.cli.look import verb_datasets, verb_explain, verb_plugins, verb_report, verb_scenes
-from gsx.cli.messages import discard_unwritten, explained, unheard
 from gsx.cli.runs import verb_eval, verb_export, verb_photographs, verb_render, verb_view
 from gsx.cli.train import verb_resume, verb_train
 from gsx.core.errors import ConfigError, nearest
 from gsx.engine.processes import processes
-from gsx.experiments.runs.messages import set_up_logging
+from gsx.experiments.runs.logs import set_up_logging
 from gsx.experiments.runs.overrides import is_override
 
 HELP = """\

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import Parser, positive, refuse_beyond, run_arguments, whole
-from gsx.cli.train import tell_report
+from gsx.cli.train import print_report
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.ranges import ZOOMS, Range
 from gsx.engine.collector import loading
@@ -56,7 +56,7 @@ def evaluate_file(path: Path, overrides: Sequence[str]) -> int:
     if getattr(settings.scene.options, "split", "") == "none":
         raise ConfigError(f"gsx eval {path} compares with test views: choose another split than scene.split=none")
     code = train(settings, loaded, folders)
-    return tell_report(code, *folders)
+    return print_report(code, *folders)
 
 
 def verb_photographs(arguments: list[str]) -> int:
@@ -73,9 +73,9 @@ def verb_photographs(arguments: list[str]) -> int:
         raise InputError("gsx photographs RUN judges a run's photographs: to train from that folder, gsx ./photographs")
     options = parser.parse_intermixed_args(arguments)
     with loading():
-        from gsx.experiments.runs.photographs import judge_photographs, lines
+        from gsx.experiments.runs.photo_check import check_photos, lines
 
-    findings = judge_photographs(options.run, plugins(), options.worst, options.overrides)
+    findings = check_photos(options.run, plugins(), options.worst, options.overrides)
     for line in lines(findings, options.worst):
         logger.info("%s", line)
     sys.stdout.write(f"{options.run / 'report.html'}\n")
@@ -129,7 +129,7 @@ def rendered(options: argparse.Namespace) -> Path:
     with loading():
         from gsx.core.files import remove_partial
         from gsx.experiments.runs.open import open_run
-        from gsx.experiments.runs.render import (
+        from gsx.experiments.runs.render_views import (
             file_pictures,
             render_orbit,
             render_path,
@@ -256,9 +256,9 @@ def exported(options: argparse.Namespace, spz: "SpzForm") -> Path:
     with loading():
         from gsx.core.files import remove_partial
         from gsx.experiments.reports.report import write_report
-        from gsx.experiments.runs.export import export, is_page, losses, shown_views
+        from gsx.experiments.runs.export import evaluation_views, export, is_page, losses
         from gsx.experiments.runs.open import open_run
-        from gsx.experiments.runs.render import view_named
+        from gsx.experiments.runs.render_views import view_named
 
     if options.from_axes != AUTO:
         raise InputError(
@@ -273,7 +273,7 @@ def exported(options: argparse.Namespace, spz: "SpzForm") -> Path:
         logger.info("--local changes nothing: %s was trained in its own coordinates", run.scene.name)
     written = export(run, path, view.camera if view else None, spz, options.bake, options.local)
     if written:
-        views = [view] if view else shown_views(run.scene)
+        views = [view] if view else evaluation_views(run.scene)
         for line in losses(run, settings, path, views, written, spz, options.local):
             logger.info("read back and rendered again: %s", line)
     if is_page(path) and path.parent.resolve() == options.run.resolve():

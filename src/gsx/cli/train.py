@@ -9,12 +9,12 @@ from typing import Any
 
 from gsx.builtin import plugins
 from gsx.cli.arguments import RESUME_FLAGS, run_arguments
-from gsx.cli.messages import explained
+from gsx.cli.exit_codes import explained
 from gsx.core.errors import ConfigError, GsxError, InputError, nearest
 from gsx.engine.collector import loading
 from gsx.engine.processes import say, speaks
 from gsx.experiments.runs.job import INTERRUPTED, carry_out, train
-from gsx.experiments.runs.messages import set_up_logging
+from gsx.experiments.runs.logs import set_up_logging
 
 logger = logging.getLogger("gsx.cli")
 
@@ -42,10 +42,10 @@ def verb_train(arguments: list[str]) -> int:
         return fill_table(arguments)
     folders: list[Path] = []
     code = train(compose(arguments, loaded := plugins()), loaded, folders)
-    return tell_report(code, folders[0])
+    return print_report(code, folders[0])
 
 
-def tell_report(code: int, *folders: Path) -> int:
+def print_report(code: int, *folders: Path) -> int:
     """Prints the report of a run that has come to its end; returns the exit code."""
     for folder in folders if code == 0 else ():
         say(f"{folder / 'report.html'}\n")
@@ -152,7 +152,7 @@ def sweep_job(config: Any) -> int:
         write_json(place[0] / "jobs" / f"{place[1]:05d}.json", record)
     if code == INTERRUPTED and not is_launched():
         raise KeyboardInterrupt
-    return tell_report(code, *folders)
+    return print_report(code, *folders)
 
 
 def verb_resume(arguments: list[str]) -> int:
@@ -185,4 +185,4 @@ def verb_resume(arguments: list[str]) -> int:
             go_on(run, settings, loaded, changed="--changed" in arguments)
             write_config(folder / "config.yaml", settings.resolved)
         logger.info("resuming %s at step %d", folder, run.step)
-        return tell_report(carry_out(run, settings, loaded), folder)
+        return print_report(carry_out(run, settings, loaded), folder)

@@ -22,7 +22,7 @@ from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.files import read_run, state_of
-from gsx.experiments.runs.photographs import different, findings_of, lines
+from gsx.experiments.runs.photo_check import different, findings_of, lines
 from gsx.modules.alignment import Motion, moved, rotation_by
 from gsx.modules.shifts import shift_of
 

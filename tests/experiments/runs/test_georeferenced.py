@@ -28,7 +28,7 @@ from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.export import export
 from gsx.experiments.runs.open import open_run, start
-from gsx.experiments.runs.render import file_pictures, run_pictures
+from gsx.experiments.runs.render_views import file_pictures, run_pictures
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.viewer.camera_path import CameraPath, Keyframe, posed, read_camera_path, write_camera_path
 from gsx.experiments.viewer.pictures import RunModel

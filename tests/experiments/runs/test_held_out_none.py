@@ -23,10 +23,10 @@ from gsx.experiments.run_folder.files import LOG, read_run, state_of
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.evaluate import summary
 from gsx.experiments.runs.execute import evaluate_again
-from gsx.experiments.runs.export import export, losses, shown_views
+from gsx.experiments.runs.export import evaluation_views, export, losses
 from gsx.experiments.runs.load_scene import held_out_none, load_scene
 from gsx.experiments.runs.open import open_run
-from gsx.experiments.runs.render import render_test_views
+from gsx.experiments.runs.render_views import render_test_views
 from gsx.experiments.tables.table import measured, problem_of
 from gsx.trackers.figures import evaluation_figures
 
@@ -95,7 +95,7 @@ def test_files_are_compared_in_training_views(folder: Path, tmp_path: Path) -> N
     run, settings = open_run(folder, plugins())
     written = export(run, tmp_path / "model.spz")
     assert written is not None
-    (line,) = losses(run, settings, tmp_path / "model.spz", shown_views(run.scene), written)
+    (line,) = losses(run, settings, tmp_path / "model.spz", evaluation_views(run.scene), written)
     assert "at worst over 4 views" in line
     export(run, tmp_path / "page.html")
     assert (tmp_path / "page.html").stat().st_size > 1000

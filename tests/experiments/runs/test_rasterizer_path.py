@@ -8,7 +8,7 @@ from raster_scenes import any_path
 
 from gsx.engine.compile_ahead import WARM_SPLATS
 from gsx.experiments.runs import rasterizer_path
-from gsx.experiments.runs.rasterizer_path import compile_beside, decide
+from gsx.experiments.runs.rasterizer_path import compile_in_background, decide
 
 CPU = torch.device("cpu")
 
@@ -29,7 +29,7 @@ def test_compiled_settings_come_when_the_picture_is_drawn(compiler):
     compiler(
         lambda splats, camera, settings, background: (drawn.append((len(splats.means), settings.path)), let.wait(30))
     )
-    thread = compile_beside(any_path(dilation=0.1, path="auto"), CPU, taken.append)
+    thread = compile_in_background(any_path(dilation=0.1, path="auto"), CPU, taken.append)
     assert taken == []
     let.set()
     thread.join(30)
@@ -44,14 +44,14 @@ def test_a_compiler_that_fails_changes_nothing(compiler, caplog):
     compiler(fail)
     taken = []
     with caplog.at_level("INFO"):
-        compile_beside(any_path(path="auto"), CPU, taken.append).join(30)
+        compile_in_background(any_path(path="auto"), CPU, taken.append).join(30)
     assert taken == []
     assert "eager path (no such instruction)" in caplog.text
 
 
 def test_who_asks_for_the_eager_path_keeps_it(compiler):
     compiler(lambda *_, **__: pytest.fail("compiled"))
-    assert not compile_beside(any_path(path="eager"), CPU, pytest.fail).is_alive()
+    assert not compile_in_background(any_path(path="eager"), CPU, pytest.fail).is_alive()
 
 
 @pytest.mark.parametrize(

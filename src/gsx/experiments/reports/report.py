@@ -22,7 +22,7 @@ from gsx.experiments.reports.overview import common_folder, runs_in, write_overv
 from gsx.experiments.reports.page import template, time_unit
 from gsx.experiments.reports.pictures import ERROR_COLOURS
 from gsx.experiments.run_folder.files import DETAIL_OF, RunFiles, detail_share, gain_of, part, read_run, state_of
-from gsx.experiments.run_folder.heads import newest_checkpoint
+from gsx.experiments.run_folder.integrity import newest_checkpoint
 from gsx.experiments.run_folder.shapes import is_number
 
 WORST = 10

@@ -10,7 +10,7 @@ from typing import Any
 from gsx.core.errors import command, first_line
 from gsx.core.files import is_file, read_json
 from gsx.experiments.run_folder import shapes
-from gsx.experiments.run_folder.heads import checkpoint_problem, newest_checkpoint, splats_problem
+from gsx.experiments.run_folder.integrity import checkpoint_problem, newest_checkpoint, splats_problem
 from gsx.experiments.run_folder.renamed import renamed
 from gsx.experiments.run_folder.shapes import fits, is_number
 from gsx.formats.suffixes import suffix_of

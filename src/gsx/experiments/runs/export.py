@@ -137,11 +137,11 @@ def refuse_export(path: Path, spz: SpzForm = SPZ_FORM) -> None:
 def page_of(run: Run, gaussians: Gaussians, comments: Sequence[str]) -> str:
     """Returns a page that starts at the first test view, or training view where none is held out."""
     up = upright(torch.stack([view.camera.rotation for view in run.scene.train]).double())
-    views, background = shown_views(run.scene)[:PAGE_VIEWS], run.scene.background.tolist()
+    views, background = evaluation_views(run.scene)[:PAGE_VIEWS], run.scene.background.tolist()
     return viewer_page(gaussians, views, up, background, f"{run.scene.name}, gsx", comments)
 
 
-def shown_views(scene: Scene) -> Sequence[View]:
+def evaluation_views(scene: Scene) -> Sequence[View]:
     """Returns the test views of a scene, or its training views where none is held out."""
     return scene.test or scene.train
 

@@ -13,7 +13,7 @@ from gsx.core.files import remove_partial
 from gsx.engine.cache import in_use
 from gsx.engine.processes import processes, say
 from gsx.engine.signals import STOPPING, handled_signals
-from gsx.experiments.runs.messages import logged_to
+from gsx.experiments.runs.logs import logged_to
 
 if TYPE_CHECKING:
     from gsx.core.plugins import Plugins
@@ -97,12 +97,12 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
     with in_use(), claimed_name(folder), ExitStack() as claims:
         run = resume_or_start(settings, loaded, stamp, claims)
         if run is None:
-            tidied(folder)
+            finish_leftovers(folder)
             return 0
         return carry_out(run, settings, loaded, keep_states=True)
 
 
-def tidied(folder: Path) -> None:
+def finish_leftovers(folder: Path) -> None:
     """Finishes what a process left of a finished run that was killed at its very end: partial files, no report.
 
     The folder's name must be claimed.

@@ -222,7 +222,7 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: Ex
         with ExitStack() as claim:
             if folder.is_dir():
                 claim.enter_context(claimed(folder))
-            run = gone_on_with(folder, files, settings, stamp)
+            run = continued(folder, files, settings, stamp)
             claims.push(claim.pop_all())
     except CheckpointError as error:
         set_aside(folder, str(error))
@@ -233,7 +233,7 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: Ex
     return run
 
 
-def gone_on_with(folder: Path, files: RunFiles, settings: Settings, stamp: str) -> Run:
+def continued(folder: Path, files: RunFiles, settings: Settings, stamp: str) -> Run:
     """Returns the run of a folder that is named by its composition.
 
     Raises:

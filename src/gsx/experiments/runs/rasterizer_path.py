@@ -47,7 +47,9 @@ def warm(run: Run, helped: bool = True) -> None:
         logger.info("compiled in %.0f s", seconds)
 
 
-def compile_beside(settings: RasterSettings, device: torch.device, take: Callable[[RasterSettings], None]) -> Thread:
+def compile_in_background(
+    settings: RasterSettings, device: torch.device, take: Callable[[RasterSettings], None]
+) -> Thread:
     """Compiles what draws pictures in a thread, then hands over settings that use it; until then the eager path draws.
 
     Nothing is handed over where nothing compiles.

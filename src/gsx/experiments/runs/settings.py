@@ -19,7 +19,7 @@ from gsx.core.training.regenerator import NamesCode
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
-from gsx.experiments.runs.compositors import with_compositors
+from gsx.experiments.runs.plugin_compositors import with_compositors
 from gsx.experiments.runs.typed import right_key, schema_keys, texts, typed
 from gsx.formats.suffixes import splat_file_at, suffix_of
 

@@ -13,7 +13,7 @@ from gsx.experiments.run_folder import checkpoint
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.progress import read_curves
-from gsx.experiments.runs.rasterizer_path import compile_beside
+from gsx.experiments.runs.rasterizer_path import compile_in_background
 from gsx.experiments.runs.start_file import rules_of
 from gsx.experiments.viewer.pictures import FileModel, RunModel
 from gsx.experiments.viewer.server import Viewer
@@ -31,7 +31,7 @@ class Watched:
         self.run, self.settings = open_run(folder, plugins)
         raster = self.run.raster
         self.run.raster = replace(raster, path="eager")  # the first pictures come at once
-        self.compiling = compile_beside(raster, self.run.device, self.faster)
+        self.compiling = compile_in_background(raster, self.run.device, self.faster)
         self.looked = time.monotonic()
 
     def refresh(self) -> bool:

@@ -15,7 +15,7 @@ from gsx.experiments.run_folder.claims import claimed_name, left_behind
 from gsx.experiments.run_folder.files import reported
 from gsx.experiments.run_folder.run_key import sorted_items
 from gsx.experiments.runs.compose import Compositions
-from gsx.experiments.runs.job import tidied
+from gsx.experiments.runs.job import finish_leftovers
 from gsx.experiments.runs.multirun import launch_jobs
 from gsx.experiments.runs.overrides import key_of, parse_overrides, refuse_absent_slurm
 from gsx.experiments.runs.typed import typed
@@ -67,7 +67,7 @@ def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], A
     launching = [word for word in overrides if key_of(word) == "hydra"]
     with in_use(), Compositions(plugins) as compositions:  # its runs begin with states of each other
         refuse_sweeps(common)
-        refuse_taken(common)
+        refuse_overrides(common)
         chosen = [word for word in overrides if key_of(word) == "experiment"]
         experiment = experiment_of([*chosen, *launching], compositions)
         datasets = datasets_of(experiment, overrides, compositions)
@@ -100,7 +100,7 @@ def tidy(folder: Path, cells: Sequence[Cell]) -> None:
     for run in dict.fromkeys(cell.folder for cell in cells if cell.finished):
         if left_behind(run) or not reported(run):
             with suppress(InputError), claimed_name(run):  # who is at work there does so himself
-                tidied(run)
+                finish_leftovers(run)
 
 
 def launched(
@@ -150,7 +150,7 @@ def fitting_words(
     return {row: [word for word in overrides if fits(word, row)] for row in rows}
 
 
-def refuse_taken(overrides: Sequence[str]) -> None:
+def refuse_overrides(overrides: Sequence[str]) -> None:
     """Raises ConfigError for overrides that a table sets for each run."""
     for word in overrides:
         key = word.lstrip("+~").partition("=")[0]

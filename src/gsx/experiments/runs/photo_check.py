@@ -34,7 +34,7 @@ FOLDER = "photographs"
 """Of the run's, with index.json and pictures of the worst."""
 
 
-def judge_photographs(folder: Path, plugins: Plugins, worst: int, overrides: Sequence[str] = ()) -> list[Finding]:
+def check_photos(folder: Path, plugins: Plugins, worst: int, overrides: Sequence[str] = ()) -> list[Finding]:
     """Returns findings on all training photographs of a run, worst first.
 
     The folder keeps them, with pictures of the `worst` ones, and the report shows them.
