@@ -20,7 +20,7 @@ import torch
 
 from gsx.builtin import plugins
 from gsx.core.data.images import read_image, write_image
-from gsx.experiments.runs.view import Watched
+from gsx.experiments.runs.view import WatchedRun
 from gsx.experiments.viewer.pictures import Look, RunModel, picture
 from gsx.experiments.viewer.server import pose_of
 from measuring.machine import ROOT, describe_machine, shown_command, told_load
@@ -110,7 +110,7 @@ def settled(page: Any) -> float:
 
 def drawn_alone(folder: Path) -> list[dict[str, Any]]:
     """Pictures a second by width, with no browser on the same cores; the first counts for nothing."""
-    watched, rows = Watched(folder, plugins()), []
+    watched, rows = WatchedRun(folder, plugins()), []
     watched.compiling.join()
     model, view = RunModel(watched.run), watched.run.scene.test[0]
     for width in WIDTHS:

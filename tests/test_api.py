@@ -219,4 +219,4 @@ def test_zlib_is_loaded_before_the_copy_in_the_wheel_of_pycolmap() -> None:
 def test_pycolmap_before_zlib_is_warned_of() -> None:
     program = "import sys; sys.modules.pop('zlib', None); sys.modules['pycolmap'] = sys; import gsx"
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stderr
-    assert "pycolmap was imported before zlib, which can end Python: import gsx first" in found
+    assert "pycolmap was imported before zlib, which can crash Python: import gsx first" in found

@@ -8,10 +8,9 @@ import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-# The wheel of pycolmap holds a zlib of its own. Whoever loads the system's first decides which functions that one
-# calls, and mixed they end the process. Loaded by Python's own module, each keeps to itself.
+# pycolmap brings its own zlib. Loaded before the system's, the two mix and the process crashes.
 if "pycolmap" in sys.modules and "zlib" not in sys.modules:
-    warnings.warn("pycolmap was imported before zlib, which can end Python: import gsx first", stacklevel=2)
+    warnings.warn("pycolmap was imported before zlib, which can crash Python: import gsx first", stacklevel=2)
 import zlib  # noqa: F401
 
 if TYPE_CHECKING:
@@ -29,7 +28,7 @@ OFFERED = ("SplatFile", "TrainedRun", "load", "show_messages", "train", "write_i
 
 
 def __getattr__(name: str) -> Any:
-    """What `gsx.api` offers."""
+    """Return a name of `gsx.api`."""
     if name not in OFFERED:
         raise AttributeError(f"module 'gsx' has no attribute '{name}'; it has {', '.join(OFFERED)}")
     return getattr(import_module("gsx.api"), name)

@@ -1,4 +1,4 @@
-"""gsx from Python: what the command line does, with pictures as tensors and figures as dictionaries.
+"""gsx from Python: the command line's functions, with pictures as tensors and figures as dictionaries.
 
     import gsx
 
@@ -54,55 +54,55 @@ __all__ = ["SplatFile", "TrainedRun", "load", "show_messages", "train", "write_i
 
 @dataclass(frozen=True, eq=False)
 class TrainedRun:
-    """A run folder, opened: its scene, its model, and what can be done with them."""
+    """An opened run folder: scene and model, with methods to render, evaluate and export."""
 
     run: Run
-    """Everything: backbone, rasterizer rules, curves (`gsx.core.training.run`)."""
+    """Backbone, rasterizer settings, curves and all else (`gsx.core.training.run`)."""
     settings: Settings
 
     @property
     def folder(self) -> Path:
-        """Where config.yaml, metrics.jsonl, evaluation.json, checkpoints, point_cloud.ply and report.html are."""
+        """Folder with config.yaml, metrics.jsonl, evaluation.json, checkpoints, point_cloud.ply and report.html."""
         return self.run.folder
 
     @property
     def report(self) -> Path:
-        """The page to open."""
+        """Page with pictures and figures."""
         return self.folder / "report.html"
 
     @property
     def step(self) -> int:
-        """Steps trained."""
+        """Number of trained steps."""
         return self.run.step
 
     @property
     def scene(self) -> Scene:
         """Training and test views with their cameras: `scene.test[0].camera`, `scene.test[0].image()`.
 
-        Positions of cameras count from `scene.origin`, which is (0, 0, 0) but for georeferenced scenes.
+        Camera positions are relative to `scene.origin`, which is (0, 0, 0) except for georeferenced scenes.
         """
         return self.run.scene
 
     def render(self, seen: Camera | View | str, zoom: float = 1) -> Float[Tensor, "3 H W"]:
-        """Returns the model as a camera, a view, or the view of that name sees it; colours in [0, 1].
+        """Render the model for a camera, a view, or a view by name; colours in [0, 1].
 
-        zoom: times the raster and the focal length.
+        zoom: factor on the raster and the focal length.
 
         Raises:
-            InputError: there is no view of that name, the nearest is told; or zoom is none of `ZOOMS`.
+            InputError: there is no view of that name (the nearest is named), or zoom is not in `ZOOMS`.
         """
         if isinstance(zoom, str) or zoom is None or float(zoom) not in ZOOMS:
             raise InputError(f"zoom is {zoom!r}: give a number {ZOOMS}")
         return render(self.run, camera_in(self.run, seen).zoom(float(zoom)), self.settings.evaluation.tile_pixels).image
 
     def evaluate(self, **options: Any) -> dict[str, Any]:
-        """Evaluates the run on its test views, as `gsx eval` does: writes evaluation.json, pictures and report anew.
+        """Evaluate the run on its test views, as `gsx eval` does, and write evaluation.json, pictures and report anew.
 
         Options are those of the group eval, for example zoom=[1, 2, 4].
 
         Raises:
-            ConfigError: there is no such option, or not with that value.
-            InputError: somebody trains in the folder, or evaluates it.
+            ConfigError: an option or its value is wrong.
+            InputError: another process trains or evaluates in the folder.
         """
         words = [f"eval.{name}={json.dumps(plain(name, value))}" for name, value in options.items()]
         return evaluate_again(self.folder, plugins(), words)
@@ -115,13 +115,13 @@ class TrainedRun:
         axes: str = SPECIFIED,
         spz_version: int = SPZ_VERSIONS[0],
     ) -> Path:
-        """Writes the model as a splat file or a page (.html), by suffix.
+        """Write the model as a splat file or a page (.html), by suffix; return its path.
 
-        seen: only what is drawn for that view or camera. local: relative to `scene.origin`, which the file states where
-        it can. axes (rub, rdf) and spz_version (3, 4): of .spz.
+        seen: write only the splats of that view or camera. local: positions relative to `scene.origin`, which the file
+        states if it can. axes (rub, rdf) and spz_version (3, 4): of .spz.
 
         Raises:
-            InputError: no such format is written, there is no such view or form of .spz, or the file is no .spz.
+            InputError: the format is not written, the view is unknown, or options of .spz are wrong.
         """
         refuse_export(path := Path(path), spz := SpzForm(version=spz_version, axes=axes))
         export(self.run, path, None if seen is None else camera_in(self.run, seen), spz, local=local)
@@ -133,22 +133,22 @@ class TrainedRun:
 
 @dataclass(eq=False)
 class SplatFile:
-    """The Gaussians of a splat file, by whatever program it was written."""
+    """Gaussians of a splat file of any program."""
 
     path: Path
     gaussians: Gaussians
     raster: RasterSettings
-    """Rules it is drawn by: as 3D-GS has them, or as Mip-Splatting where the file says so (SplatRenderMode: mip)."""
+    """Rasterizer settings: those of 3D-GS, or of Mip-Splatting if the file says so (SplatRenderMode: mip)."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Subtracted from `gaussians`, whose file lies far from (0, 0, 0); `render` moves cameras likewise."""
+    """Offset subtracted from positions of a file far from (0, 0, 0); `render` moves cameras likewise."""
 
     def render(
         self, seen: Camera | View, background: Sequence[float] | Float[Tensor, "3"] = (0, 0, 0)
     ) -> Float[Tensor, "3 H W"]:
-        """Returns the splats as a camera or a view sees them over a colour; colours in [0, 1].
+        """Render the splats for a camera or a view over a background; colours in [0, 1].
 
         Raises:
-            InputError: the background is no colour.
+            InputError: the background is not a colour.
         """
         try:
             over = torch.as_tensor(background, dtype=torch.float32).reshape(3)
@@ -162,42 +162,40 @@ class SplatFile:
         return f"<{len(self.gaussians.means):,} splats of {self.path}>"
 
 
-def camera_in(run: Run, seen: Camera | View | str) -> Camera:
-    """Returns a camera, that of a view, or that of a run's view of that name; see `camera_of` and `view_named`."""
-    return camera_of(view_named(run, seen) if isinstance(seen, str) else seen)
+def camera_in(run: Run, view: Camera | View | str) -> Camera:
+    """Return a camera, that of a view, or that of a run's view by name."""
+    return camera_of(view_named(run, view) if isinstance(view, str) else view)
 
 
-def camera_of(seen: Camera | View) -> Camera:
-    """Returns a camera, or that of a view.
-
-    Raises:
-        InputError: it is neither.
-    """
-    camera = seen.camera if isinstance(seen, View) else seen
+def camera_of(view: Camera | View) -> Camera:
+    """Return a camera, or that of a view; raise InputError for anything else."""
+    camera = view.camera if isinstance(view, View) else view
     if not isinstance(camera, Camera):
-        raise InputError(f"{seen!r} is no camera: give one, or a view of `run.scene`, or of a run the name of a view")
+        raise InputError(f"{view!r} is not a camera: give one, a view of `run.scene`, or for a run the name of a view")
     return camera
 
 
 def train(*words: str, **values: Any) -> TrainedRun:
-    """Trains, evaluates and reports: `gsx WORDS... KEY=VALUE...`.
+    """Train, evaluate and report: `gsx WORDS... KEY=VALUE...`.
 
-    Keys with dots or a slash are words as on the command line, those with dots also dictionaries:
-    `gsx.train("regenerator/upscale=lanczos", "eval.zoom=[1,2]", training={"supersample": 2}, iterations=900)`.
+    Keys with dots or a slash are words as on the command line; keys with dots can also be dictionaries:
+    `gsx.train("regenerator/upscale=lanczos", "eval.zoom=[1,2]", training={"batch": 2}, iterations=900)`.
 
     Raises:
-        ConfigError, InputError: something is wrong with the configuration or the scene; nothing was made.
-        TrainingError: training went wrong; the run folder holds the last step.
-        KeyboardInterrupt: it was stopped; `gsx resume` goes on with the folder.
+        ConfigError, InputError: the configuration or the scene is wrong; no folder was made.
+        TrainingError: training failed; the run folder holds the last step.
+        KeyboardInterrupt: it was stopped; `gsx resume` continues the folder.
     """
     for word in words:
         if not (isinstance(word, str) and is_override(word) and not word.startswith("-")):
-            raise ConfigError(f"gsx.train was given {word!r}: give settings, as 'scene=colmap' and 'scene.path=FOLDER'")
+            raise ConfigError(
+                f"gsx.train cannot use {word!r}: give settings, for example 'scene=colmap'"
+            )
     overrides, folders = [*words, *words_of(values)], list[Path]()
     if is_table(overrides) or processes() > 1:
         raise ConfigError("gsx.train trains one run in one process: tables and torchrun are for the command line")
     if train_job(compose(overrides, loaded := plugins()), loaded, folders):
-        raise KeyboardInterrupt(f"{command('resume', folders[0])} goes on")
+        raise KeyboardInterrupt(f"{command('resume', folders[0])} continues")
     return load_run(folders[0])
 
 
@@ -207,11 +205,11 @@ def load(
     origin: tuple[float, float, float] = NO_ORIGIN,
     axes: str = AUTO,
 ) -> TrainedRun | SplatFile:
-    """Opens a run folder or a splat file of any kind (`gsx.formats.suffixes.READABLE`).
+    """Open a run folder or a splat file of any format (`gsx.formats.suffixes.READABLE`).
 
-    raster: the rules by which a splat file is drawn, in place of those that it states.
-    origin: from where the coordinates of cameras count, `run.scene.origin` for the views of a georeferenced run.
-    axes: of the splat file: auto (what it states, else its format's), rub, rdf, or any three letters.
+    raster: rasterizer settings in place of those that a splat file states. origin: of the cameras' coordinates,
+    `run.scene.origin` for views of a georeferenced run. axes: of the splat file: auto (stated, else by format), rub,
+    rdf, or any three letters.
 
     Raises:
         InputError: it is neither, or damaged; or `raster`, `origin` or `axes` are set for a run, which has its own.
@@ -219,9 +217,9 @@ def load(
     """
     path = splat_file_at(expand_home(path))
     if path.is_dir():
-        for name, given in {"raster": raster is not None, "origin": any(origin), "axes": axes != AUTO}.items():
-            if given:
-                raise InputError(f"{path} is a run, drawn as it was trained: {name} is for splat files")
+        for name, is_set in {"raster": raster is not None, "origin": any(origin), "axes": axes != AUTO}.items():
+            if is_set:
+                raise InputError(f"{path} is a run, rendered as it was trained: {name} is for splat files")
         return load_run(path)
     if not path.exists():
         raise InputError(f"'{path}' does not exist: give a run folder or a splat file")
@@ -231,12 +229,12 @@ def load(
 
 
 def load_run(folder: Path) -> TrainedRun:
-    """Opens a run folder; errors as `load`."""
+    """Open a run folder; errors as `load`."""
     return TrainedRun(*open_run(folder.resolve(), plugins()))
 
 
 def words_of(values: Mapping[str, Any], below: str = "") -> list[str]:
-    """Returns values by name, nested ones too, as words of the command line."""
+    """Return values by name, nested ones too, as words of the command line."""
     words = []
     for name, value in values.items():
         if isinstance(value, Mapping):
@@ -247,18 +245,14 @@ def words_of(values: Mapping[str, Any], below: str = "") -> list[str]:
 
 
 def text_of(value: Any) -> str:
-    """Returns a plain value as the command line has it."""
+    """Return a plain value in the syntax of the command line."""
     if isinstance(value, list):
         return f"[{','.join(map(text_of, value))}]"
     return quoted(value) if isinstance(value, str) else json.dumps(value)
 
 
 def plain(name: str, value: Any) -> Any:
-    """Returns a value as JSON has it: numbers of numpy and torch as those of Python, paths as texts.
-
-    Raises:
-        ConfigError: it is of no kind that a configuration holds.
-    """
+    """Return a value of JSON: convert numbers of numpy and torch, and paths; raise ConfigError for other types."""
     if isinstance(value, list | tuple):
         return [plain(name, inner) for inner in value]
     if isinstance(value, Path):

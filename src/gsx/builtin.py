@@ -1,4 +1,4 @@
-"""The built-in plugin: what ships with gsx enters through the same hooks as third parties."""
+"""The built-in plugin: the components of gsx use the same hooks as third parties."""
 
 import sys
 from functools import partial
@@ -8,14 +8,14 @@ from gsx.core.plugins import Plugins, Registry, hookimpl, load_plugins
 
 @hookimpl
 def gsx_register(registry: Registry) -> None:
-    """Registers scenes, backbones, modules, augmenters, regenerators and trackers of gsx itself."""
+    """Register the components of gsx itself."""
     for add in (add_scenes, add_backbones, add_modules, add_augmenters, add_regenerators, add_diffusion, add_trackers):
         add(registry)
     add_compositors(registry)
 
 
 def add_scenes(registry: Registry) -> None:
-    """Registers loaders, one for each format; of two that can read a folder the later is the more specific."""
+    """Register loaders by format; of two that can read a folder the later is the more specific."""
     from gsx.scenes import blender, bungee, colmap, demo, photos, room, transforms
 
     registry.add("scene", "demo", demo.load, demo.DemoOptions)
@@ -28,7 +28,7 @@ def add_scenes(registry: Registry) -> None:
 
 
 def add_backbones(registry: Registry) -> None:
-    """Registers free Gaussians and anchors, with and without levels and filters."""
+    """Register free Gaussians and anchors, with and without levels and filters."""
     from gsx.backbones.anchor_options import NeuralOptions
     from gsx.backbones.anchors import neural_anchors
     from gsx.backbones.gs3d import gs3d
@@ -43,7 +43,7 @@ def add_backbones(registry: Registry) -> None:
 
 
 def add_modules(registry: Registry) -> None:
-    """Schedules, stopping rules and corrections of photos, in the order in which a run has them."""
+    """Register schedules, stopping rules and corrections of photos, in the order of a run's modules."""
     from gsx.modules.catalogue import MODULES
 
     for name, (factory, options) in MODULES.items():
@@ -51,7 +51,7 @@ def add_modules(registry: Registry) -> None:
 
 
 def add_augmenters(registry: Registry) -> None:
-    """Registers one procedure under four names, each with numbers of its own."""
+    """Register one procedure under four names with different numbers."""
     from gsx.augmenters.pseudo_details import PseudoDetails
     from gsx.augmenters.pseudo_options import PseudoOptions
 
@@ -60,7 +60,7 @@ def add_augmenters(registry: Registry) -> None:
 
 
 def add_regenerators(registry: Registry) -> None:
-    """Registers filters, networks that learn from the scene itself, and functions."""
+    """Register filters, networks that learn from the scene itself, and functions."""
     from gsx.regenerators.called import Called, CalledOptions
     from gsx.regenerators.classical import Oracle, PlainOptions, Resampled, Unchanged
     from gsx.regenerators.scene_restorer import RestorerOptions, SceneRestorer
@@ -74,17 +74,8 @@ def add_regenerators(registry: Registry) -> None:
     registry.add("regenerator", "callable", Called, CalledOptions)
 
 
-def add_compositors(registry: Registry) -> None:
-    """Registers what blends splats: eager torch, compiled loops, pixel windows, gsplat."""
-    from gsx.core.rasterizer.compositor import NoOptions
-    from gsx.engine.compositors import COMPOSITORS
-
-    for name, compositor in COMPOSITORS.items():
-        registry.add("compositor", name, lambda options, made=compositor: made, NoOptions)
-
-
 def add_diffusion(registry: Registry) -> None:
-    """Registers diffusion models, whose packages are imported when one is used."""
+    """Register diffusion models; their packages are imported at first use."""
     from gsx.regenerators.diffusion.cascade import Cascade, CascadeOptions
     from gsx.regenerators.diffusion.model_specs import SD_X2_LATENT, SD_X4, SDXL_TURBO
     from gsx.regenerators.diffusion.options import PipelineOptions, RestorerOptions, UpscalerOptions
@@ -98,7 +89,7 @@ def add_diffusion(registry: Registry) -> None:
 
 
 def add_trackers(registry: Registry) -> None:
-    """Registers listeners that report a run to other programs."""
+    """Register listeners that report a run to other programs."""
     from gsx.trackers.mlflow import MLflow, MLflowOptions
     from gsx.trackers.tensorboard import TensorBoard, TensorBoardOptions
 
@@ -106,6 +97,15 @@ def add_trackers(registry: Registry) -> None:
     registry.add("tracker", "mlflow", MLflow, MLflowOptions)
 
 
+def add_compositors(registry: Registry) -> None:
+    """Register blending of splats: eager torch, compiled loops, pixel windows, gsplat."""
+    from gsx.core.rasterizer.compositor import NoOptions
+    from gsx.engine.compositors import COMPOSITORS
+
+    for name, compositor in COMPOSITORS.items():
+        registry.add("compositor", name, lambda options, made=compositor: made, NoOptions)
+
+
 def plugins() -> Plugins:
-    """Returns built-in and installed plugins."""
+    """Load built-in and installed plugins."""
     return load_plugins([("gsx", sys.modules[__name__])])

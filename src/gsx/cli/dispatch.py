@@ -1,135 +1,141 @@
-"""The command line: `gsx OVERRIDES...` trains; verbs do the rest. torch is imported only where it is needed."""
+"""The command line: `gsx OVERRIDES...` trains; verbs do the rest. torch is imported only after the words are parsed."""
 
 import io
 import sys
 from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import Any
 
 from gsx import __version__
-from gsx.cli.arguments import RESUME_FLAGS
-from gsx.cli.compact import verb_compact
-from gsx.cli.exit_codes import discard_unwritten, explained, unheard
-from gsx.cli.folder import is_given, train_from
-from gsx.cli.look import verb_datasets, verb_explain, verb_plugins, verb_report, verb_scenes
-from gsx.cli.runs import verb_eval, verb_export, verb_photographs, verb_render, verb_view
-from gsx.cli.train import verb_resume, verb_train
+from gsx.cli import arguments as parsers
+from gsx.cli.exit_codes import discard_unwritten, report_closed_output, report_error
 from gsx.core.errors import ConfigError, nearest
+from gsx.core.files import at_home
+from gsx.engine.collector import loading
 from gsx.engine.processes import processes
 from gsx.experiments.runs.logs import set_up_logging
 from gsx.experiments.runs.overrides import is_override
 
 HELP = """\
-gsx trains and evaluates 3D Gaussian Splatting models, with an eye for what happens when you zoom in.
+gsx trains 3D Gaussian splats from photos, zooms in, and measures how much of the detail is real.
 
-  gsx                                            train the built-in scene (start here; a few minutes on a laptop)
-  gsx FOLDER                                     train from what is in it: photos, COLMAP, transforms; or from a VIDEO
+  gsx                        train the built-in demo scene: start here, a few minutes on a laptop
+  gsx FOLDER                 train from a folder: photos, COLMAP, transforms.json; or from a VIDEO
+  gsx view RUN               look around in the browser (needs gsx[viewer]); RUN is the folder of the report
+  gsx resume RUN             continue an interrupted run; iterations=N trains longer
+  gsx eval RUN 'eval.zoom=[1,2,4]'  measure a run again, here also zoomed in
+  gsx export RUN model.ply   write a splat file (.ply, .compressed.ply, .spz, .sog, .glb) or a web page (.html)
+
+More commands; view, eval and export also take splat files of other programs:
+  gsx scenes FOLDER          check photos before training: format, cameras, sharpness, exposure, coverage
+  gsx photographs RUN        find training photos with wrong exposure or pose, blur or passers-by
+  gsx render RUN             save test views as PNG; animate --orbit FILE.gif or a camera --path FILE.json
+  gsx compact RUN            shrink a model while PSNR drops by at most --max-drop-db 0.1
+  gsx report DIR ...         write report.html of a run, or one page that compares all runs below some folders
+  gsx explain KEY            explain a setting: value, range, meaning, and the file that sets it
+  gsx datasets, gsx plugins  list the paper's datasets on this machine; list installed components
+
+Every setting is a word KEY=VALUE:
   gsx scene=colmap scene.path=FOLDER scene.downscale=4 iterations=2000 'eval.zoom=[1,2,4]'
+  gsx --cfg job --resolve    print the settings instead of training
+  gsx -m KEY=A,B ...         train once per combination; hydra/launcher=processes|slurm trains several at once
+  gsx variant=octree_ub dataset=mipnerf360 dataset.scene=garden budget=paper|quick|smoke   train a published method
+  gsx +experiment=TABLE ...  reproduce a table of the paper; finished runs are reused
+  torchrun --nproc-per-node 2 -m gsx training.batch=2 ...   train on two GPUs (docs/how-to/sweeps-and-clusters.md)
 
-  gsx OVERRIDES...          train, evaluate and report; any configuration value can be overridden
-  gsx resume RUN [K=V ...]  go on where a run stopped, bit for bit; iterations=N lengthens it
-  gsx view RUN|FILE         look around in a browser, also while RUN is trained (gsx[viewer]); or viewer=true
-  gsx eval RUN|FILE [K=V ...]  evaluate a run again, with 'eval.zoom=[1,2,4]'; or a splat file on scene=...
-  gsx photographs RUN       what is wrong with training photographs: exposure, pose, blur, passers-by; the ten worst
-  gsx render RUN|FILE       test views as PNG, --orbit FILE.gif (.webp, .mp4: gsx[video]), or along --path CAMERAS.json
-  gsx export RUN|FILE [TO]  splat file by suffix (.ply, .compressed.ply, .spz, .sog, .glb), or .html: one page to send
-  gsx compact RUN|FILE      the smallest model that looks the same: --max-drop-db 0.1; FILE with scene=...
-  gsx report DIR [DIR ...]  report.html of a run, or one page over all runs of some folders; --to FOLDER
-  gsx scenes PATH           what is this folder: format, cameras, images, points, problems
-  gsx datasets [NAME ...]   the paper's datasets: what is expected below data_root=FOLDER, found, missing
-  gsx explain KEY           a key or group of the configuration: value, range, comment, and the file that sets it
-  gsx plugins               what is installed, from where, and what failed to load
-
-  gsx --cfg job --resolve   print the configuration instead of training
-  gsx -m K=V1,V2 ...        a run for every combination; hydra/launcher=processes|slurm for several at once
-  gsx variant=octree_ub ... a method of the paper; dataset=mipnerf360 dataset.scene=garden budget=paper|quick|smoke
-  gsx +experiment=TABLE ... a table of the paper: runs what is missing, skips what is finished
-  torchrun --nproc-per-node 2 -m gsx training.batch=2 ...   one scene on two GPUs (docs/how-to/sweeps-and-clusters.md)
-  gsx --version, gsx --help, gsx VERB --help
-
-Completion: eval "$(gsx -sc install=bash)". In zsh quote brackets: 'eval.zoom=[1,2]'.
+gsx VERB --help explains a command. Tab completion: eval "$(gsx -sc install=bash)". In zsh quote brackets.
 """
 TRADE_MOVED = (
-    "gsx trade is gone. Compare settings of a training with `gsx -m KEY=A,B ...`, whose page draws the fronts; "
-    "`python benchmarks/trades.py --what rasterizer` measures those of the rasterizer (docs/how-to/choose-settings.md)"
+    "gsx trade was removed. Compare settings with `gsx -m KEY=A,B ...`, whose page plots quality against cost, or "
+    "measure the rasterizer with `python benchmarks/trades.py --what rasterizer` (docs/how-to/choose-settings.md)"
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line and returns the exit code.
+    """Run the command line and return the exit code.
 
-    0: done; 2: something for the user to correct; 130: interrupted; 141: nobody reads on (`| head`).
+    0: done; 2: an error that the user can correct; 130: interrupted; 141: the reader of a pipe has gone (`| head`).
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors in ("strict", "surrogateescape"):
-        unicode = sys.stdout.encoding.lower().startswith("utf")  # then only bytes of file names are no letters of it
+        unicode = sys.stdout.encoding.lower().startswith("utf")  # then only bytes of file names are not text
         sys.stdout.reconfigure(errors="surrogateescape" if unicode else "backslashreplace")
     if processes() > 1:
         from gsx.engine.joined_ranks import run_together
 
-        return run_together(lambda: dispatch_together(arguments), explained)
+        return run_together(lambda: dispatch_together(arguments), report_error)
     try:
         code = dispatch(arguments)
-        sys.stdout.flush()  # what nobody takes is noticed here, not when Python ends
+        sys.stdout.flush()  # a closed pipe raises here, not when Python ends
         return code
     except BrokenPipeError as error:
-        return unheard(error)
+        return report_closed_output(error)
     except BaseException as error:
-        code = explained(error)
+        code = report_error(error)
         discard_unwritten()
         return code
 
 
 def dispatch_together(arguments: list[str]) -> int:
-    """Trains or resumes on several processes.
-
-    Raises:
-        ConfigError: anything else is asked for.
-    """
+    """Train or resume on several processes; raise ConfigError for anything else."""
     from gsx.experiments.tables.sweep import is_table
 
     flags = {word for word in arguments if word.startswith("-")}
-    allowed = set(RESUME_FLAGS) if arguments[:1] == ["resume"] else set()
+    allowed = set(parsers.RESUME_FLAGS) if arguments[:1] == ["resume"] else set()
     if flags - allowed or set(arguments[:1]) & (VERBS.keys() - {"resume"}):
         words = " ".join(arguments[:2])
         raise ConfigError(f"gsx {words}: torchrun is for training one scene and for gsx resume; call gsx without it")
-
     if is_table(arguments):
-        raise ConfigError("torchrun trains one run and a table has many: call gsx without torchrun")
+        raise ConfigError("torchrun trains one run, a table has many: call gsx without torchrun")
     return dispatch(arguments)
 
 
 def dispatch(arguments: list[str]) -> int:
-    """Finds the verb and runs it."""
-    if arguments[:1] == ["help"] or ({"--help", "-h"} & set(arguments) and arguments[0] not in VERBS):
+    """Run the command that the words name."""
+    first = arguments[0] if arguments else ""
+    if first == "help" or ({"--help", "-h"} & set(arguments) and first not in VERBS):
         sys.stdout.write(HELP)
         return 0
     if arguments == ["--version"]:
         sys.stdout.write(f"gsx {__version__}\n")
         return 0
-    if not arguments or is_override(arguments[0]):
-        return verb_train(arguments)
-    if arguments[0] == "trade":
-        raise ConfigError(TRADE_MOVED)
-    if arguments[0] not in VERBS and is_given(arguments[0]):
-        set_up_logging()
-        return train_from(arguments)
-    if arguments[0] not in VERBS:
-        problem = f"'{arguments[0]}' is no verb of gsx, and no folder."
-        raise ConfigError(f"{problem}{nearest(arguments[0], VERBS)} See gsx --help")
     set_up_logging()
-    return VERBS[arguments[0]](arguments[1:])
+    if not arguments or is_override(first):
+        return TRAIN(arguments)
+    if first in VERBS:
+        return VERBS[first](arguments[1:])
+    if first == "trade":
+        raise ConfigError(TRADE_MOVED)
+    if at_home(first).exists():
+        return TRAIN_FOLDER(arguments)
+    raise ConfigError(f"Unknown command or path '{first}'.{nearest(first, VERBS)} See gsx --help")
 
 
-VERBS: dict[str, Callable[[list[str]], int]] = {
-    "resume": verb_resume,
-    "eval": verb_eval,
-    "photographs": verb_photographs,
-    "render": verb_render,
-    "export": verb_export,
-    "compact": verb_compact,
-    "view": verb_view,
-    "report": verb_report,
-    "scenes": verb_scenes,
-    "datasets": verb_datasets,
-    "explain": verb_explain,
-    "plugins": verb_plugins,
+def command(parse: Callable[[list[str]], Any], module: str, function: str) -> Callable[[list[str]], int]:
+    """Return a command that parses its words, then imports and calls the function of a module of `gsx.cli`."""
+
+    def run(arguments: list[str]) -> int:
+        options = parse(arguments)
+        with loading():
+            imported = import_module(f"gsx.cli.{module}")
+        return int(getattr(imported, function)(options))
+
+    return run
+
+
+TRAIN = command(parsers.parse_train, "train", "train")
+TRAIN_FOLDER = command(parsers.parse_folder, "folder", "train_folder")
+VERBS = {
+    "resume": command(parsers.parse_resume, "train", "resume"),
+    "eval": command(parsers.parse_eval, "runs", "evaluate"),
+    "photographs": command(parsers.parse_photographs, "runs", "check_photographs"),
+    "render": command(parsers.parse_render, "runs", "render"),
+    "view": command(parsers.parse_view, "runs", "view"),
+    "export": command(parsers.parse_export, "files", "export_file"),
+    "compact": command(parsers.parse_compact, "files", "compact_model"),
+    "report": command(parsers.parse_report, "facts", "report"),
+    "scenes": command(parsers.parse_scenes, "facts", "check_scene"),
+    "datasets": command(parsers.parse_datasets, "facts", "list_datasets"),
+    "explain": command(parsers.parse_explain, "facts", "explain_key"),
+    "plugins": command(parsers.parse_plugins, "facts", "list_plugins"),
 }

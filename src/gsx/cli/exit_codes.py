@@ -1,4 +1,4 @@
-"""What people read: errors as one sentence, messages of the log."""
+"""Errors as one sentence with an exit code, and output whose reader has gone."""
 
 import errno
 import os
@@ -7,13 +7,16 @@ import sys
 
 from gsx.core.errors import GsxError
 from gsx.engine.processes import say
-from gsx.experiments.runs.job import INTERRUPTED
+from gsx.engine.signals import INTERRUPTED
+
+CLOSED_PIPE = 128 + 13
+"""Exit code when the reader of standard output has gone: shells report SIGPIPE like this."""
 
 
-def explained(error: BaseException) -> int:
-    """Shows an error that people can correct and returns its exit code; raises others again."""
+def report_error(error: BaseException) -> int:
+    """Print an error that the user can correct and return its exit code; raise others again."""
     if isinstance(error, KeyboardInterrupt):
-        say("\ngsx: interrupted; nothing half-written is left\n", as_error=True)
+        say("\ngsx: interrupted; no half-written files are left\n", as_error=True)
         return INTERRUPTED
     if not isinstance(error, GsxError | OSError):
         raise error
@@ -21,45 +24,41 @@ def explained(error: BaseException) -> int:
     return 2
 
 
-UNHEARD = 128 + 13
-"""Exit code where standard output is a pipe that nobody reads any more, as shells tell SIGPIPE."""
+def os_sentence(error: OSError) -> str:
+    """Return a failure of the file system with its remedy."""
+    where = f" ({error.filename})" if error.filename else ""
+    remedy = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "check that path and its permissions"
+    place = "a writable place: output=FOLDER for training, --to FOLDER for commands that have it"
+    return f"{error.strerror or error}{where}: {remedy}, or choose {place}"
 
 
-def unheard(error: BrokenPipeError) -> int:
-    """Says nothing more on standard output, if it is that which nobody reads any more (`gsx plugins | head -3`)."""
-    if not unread():
-        return explained(error)
+def report_closed_output(error: BrokenPipeError) -> int:
+    """Discard further output if standard output has no reader (`gsx plugins | head -3`); report other broken pipes."""
+    if not has_no_reader():
+        return report_error(error)
     discard_output()
-    return UNHEARD
+    return CLOSED_PIPE
 
 
-def discard_output() -> None:
-    """Discards standard output: Python would write again at its end, and complain in words of its own."""
-    with open(os.devnull, "w") as nowhere:
-        os.dup2(nowhere.fileno(), sys.stdout.fileno())
+def has_no_reader() -> bool:
+    """Return True if standard output is a pipe without a reader."""
+    try:
+        watched = select.poll()
+        watched.register(sys.stdout.fileno(), 0)
+    except (AttributeError, OSError, ValueError):  # Windows has no poll, notebooks no file descriptor
+        return False
+    return any(event & select.POLLERR for _, event in watched.poll(0))
 
 
 def discard_unwritten() -> None:
-    """Discards standard output if it takes nothing (a full disk)."""
+    """Discard output that cannot be written (a full disk)."""
     try:
         sys.stdout.flush()
     except OSError:
         discard_output()
 
 
-def unread() -> bool:
-    """Returns whether standard output is a pipe without a reader."""
-    try:
-        watched = select.poll()
-        watched.register(sys.stdout.fileno(), 0)
-    except (AttributeError, OSError, ValueError):  # Windows has no poll, notebooks no number of the file
-        return False
-    return any(event & select.POLLERR for _, event in watched.poll(0))
-
-
-def os_sentence(error: OSError) -> str:
-    """Returns a failure of the file system with its remedy."""
-    where = f" ({error.filename})" if error.filename else ""
-    remedy = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "check that path and its permissions"
-    place = "a writable place: output=FOLDER to train, --to FOLDER where a command has that"
-    return f"{error.strerror or error}{where}: {remedy}, or choose {place}"
+def discard_output() -> None:
+    """Discard standard output: Python would write again at exit and print its own error."""
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())

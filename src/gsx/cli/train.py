@@ -2,118 +2,109 @@
 
 import logging
 import sys
+from argparse import Namespace
 from contextlib import nullcontext, redirect_stdout
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 from gsx.builtin import plugins
-from gsx.cli.arguments import RESUME_FLAGS, run_arguments
-from gsx.cli.exit_codes import explained
-from gsx.core.errors import ConfigError, GsxError, InputError, nearest
-from gsx.engine.collector import loading
+from gsx.cli.exit_codes import report_error
+from gsx.core.errors import ConfigError, GsxError, InputError
+from gsx.core.files import read_json, write_json
+from gsx.engine.cache import in_use
 from gsx.engine.processes import say, speaks
-from gsx.experiments.runs.job import INTERRUPTED, carry_out, train
+from gsx.engine.signals import INTERRUPTED
+from gsx.experiments.reports.overview import write_overview
+from gsx.experiments.run_folder.claims import claimed
+from gsx.experiments.run_folder.files import read_run, reported, state_of
+from gsx.experiments.runs import job
+from gsx.experiments.runs.compose import compose
+from gsx.experiments.runs.history import record_changes
+from gsx.experiments.runs.launched import ended_from_without, is_launched, waiting_for_all
 from gsx.experiments.runs.logs import set_up_logging
+from gsx.experiments.runs.multirun import check_overrides, hydra_main, job_place, launch
+from gsx.experiments.runs.open import open_run, refuse_other, stamped_folder
+from gsx.experiments.runs.overrides import quoted, with_quoted_paths
+from gsx.experiments.runs.saved_settings import write_config
+from gsx.experiments.runs.settings import settings_from
+from gsx.experiments.tables.sweep import is_table, run_table
 
 logger = logging.getLogger("gsx.cli")
 
-HYDRA_FLAGS = (
-    *("-m", "--multirun", "-sc", "--shell-completion", "--info", "--hydra-help"),
-    *("--cfg", "-c", "-p", "--package", "--resolve"),
-)
-"""Flags that are handed to Hydra as they are."""
 
-
-def verb_train(arguments: list[str]) -> int:
-    """gsx OVERRIDES..."""
-    set_up_logging()
-    flags = [word for word in arguments if word.startswith("-")]
-    for flag in flags:
-        if flag.split("=")[0] not in HYDRA_FLAGS:
-            raise ConfigError(f"'{flag}' is no option of gsx.{nearest(flag, HYDRA_FLAGS)} See gsx --help")
-    if flags:
-        return hand_to_hydra(arguments)
-    with loading():
-        from gsx.experiments.runs.compose import compose
-        from gsx.experiments.tables.sweep import is_table
-
-    if is_table(arguments):
-        return fill_table(arguments)
+def train(words: list[str]) -> int:
+    """Train one run, several (`-m`) or a table, or let Hydra print something, by the words of the command line."""
+    several = bool({"-m", "--multirun"} & set(words))
+    if several:
+        return train_several(words)
+    if any(word.startswith("-") for word in words):
+        return print_by_hydra(words)
+    if is_table(words):
+        return fill_table(words)
     folders: list[Path] = []
-    code = train(compose(arguments, loaded := plugins()), loaded, folders)
+    code = job.train(compose(words, loaded := plugins()), loaded, folders)
     return print_report(code, folders[0])
 
 
 def print_report(code: int, *folders: Path) -> int:
-    """Prints the report of a run that has come to its end; returns the exit code."""
+    """Print the reports of finished runs; return the exit code."""
     for folder in folders if code == 0 else ():
         say(f"{folder / 'report.html'}\n")
     return code
 
 
-def fill_table(arguments: list[str]) -> int:
-    """gsx +experiment=TABLE ..."""
-    from gsx.experiments.tables.sweep import run_table
-
+def fill_table(words: list[str]) -> int:
+    """Run what is missing of a table (`+experiment=TABLE`) and print it."""
     try:
-        text, code = run_table(arguments, plugins(), sweep_job)
+        text, code = run_table(words, plugins(), sweep_job)
     except KeyboardInterrupt:
-        say("\ngsx: interrupted; the same command goes on with what is missing\n", as_error=True)
+        say("\ngsx: interrupted; repeat the command to run what is missing\n", as_error=True)
         return INTERRUPTED
     sys.stdout.write(text)
     return code
 
 
-def hand_to_hydra(arguments: list[str]) -> int:
-    """Runs multiruns, completion and information flags by Hydra's command line; a multirun ends with one report."""
-    with loading():
-        from gsx.experiments.runs.launched import waiting_for_all
-        from gsx.experiments.runs.multirun import check_overrides, hydra_main, launch
-        from gsx.experiments.runs.open import stamped_folder
-        from gsx.experiments.runs.overrides import quoted, with_quoted_paths
-        from gsx.experiments.tables.sweep import is_table
+def print_by_hydra(words: list[str]) -> int:
+    """Print the configuration, completion or Hydra's help by Hydra's command line."""
+    try:
+        with redirect_stdout(StringIO()) as text:  # Hydra shows a traceback where it cannot write
+            hydra_main(with_quoted_paths(words), plugins(), sweep_job)
+    finally:  # it may end the program
+        sys.stdout.write(text.getvalue())
+    return 0
 
-    if is_table(arguments) and {"-m", "--multirun"} & set(arguments):
-        raise ConfigError("a table is many runs already: leave out -m, launchers work without it")
-    loaded = plugins()
-    if not {"-m", "--multirun"} & set(arguments):
-        arguments = with_quoted_paths(arguments)
-        try:
-            with redirect_stdout(StringIO()) as text:  # Hydra shows a traceback where it cannot write
-                hydra_main(arguments, loaded, sweep_job)
-        finally:  # it may end the program
-            sys.stdout.write(text.getvalue())
-        return 0
-    overrides = with_quoted_paths([word for word in arguments if not word.startswith("-")])
-    refuse_for_sweeps(arguments)
+
+def train_several(words: list[str]) -> int:
+    """Train one run per combination by Hydra's launcher; print one report over all. Return the worst exit code."""
+    refuse_for_sweeps(words)
+    overrides, loaded = with_quoted_paths([word for word in words if not word.startswith("-")]), plugins()
     output, of_launcher = check_overrides(overrides, loaded)
     sweep, code = stamped_folder(output / "sweeps"), 0
     try:
         with waiting_for_all(sweep):
             launch(["-m", *overrides, *of_launcher, f"hydra.sweep.dir={quoted(str(sweep))}"], loaded, sweep_job)
     except KeyboardInterrupt:
-        say("\ngsx: interrupted; runs that were begun say above how to go on\n", as_error=True)
+        say("\ngsx: interrupted; the lines above show how to continue each run\n", as_error=True)
         code = INTERRUPTED
     finally:
         code = max(code, close_sweep(sweep))
     return code
 
 
-def refuse_for_sweeps(arguments: list[str]) -> None:
-    """Raises ConfigError for flags that train nothing, and for the place of a multirun's record."""
-    for word in arguments:
+def refuse_for_sweeps(words: list[str]) -> None:
+    """Raise ConfigError for a table, flags that do not train, and a place for the multirun's record."""
+    if is_table(words):
+        raise ConfigError("a table already trains several runs: leave out -m; launchers work without it")
+    for word in words:
         if word.startswith("-") and word not in ("-m", "--multirun"):
-            raise ConfigError(f"-m trains several runs, and {word} trains none: leave one of them out")
+            raise ConfigError(f"-m trains several runs, {word} trains none: leave one of them out")
         if word.lstrip("+").startswith("hydra.sweep.dir="):
             raise ConfigError(f"'{word}': a multirun's record goes below output/sweeps; give output=FOLDER")
 
 
 def close_sweep(sweep: Path) -> int:
-    """Reports on the runs that a multirun has made; returns the worst exit code of its jobs."""
-    from gsx.core.files import read_json
-    from gsx.experiments.reports.overview import write_overview
-
+    """Print the report over the runs of a multirun; return the worst exit code of its jobs."""
     records = [read_json(path) for path in sorted((sweep / "jobs").glob("*.json"))]
     folders = [folder for record in records if record["folder"] and (folder := Path(record["folder"])).is_dir()]
     if folders:
@@ -122,28 +113,23 @@ def close_sweep(sweep: Path) -> int:
 
 
 def sweep_job(config: Any) -> int:
-    """Runs one job of a multirun or a table, here or in a launcher's process; its record stays with the sweep.
+    """Run one job of a multirun or a table, here or in a launcher's process; write its record below the sweep.
 
-    An error is shown and does not end the other jobs; Ctrl-C does, where a launcher's processes are in the end of all.
+    An error is printed and the other jobs continue. Ctrl-C ends them; launcher processes record it first.
     """
-    from gsx.core.files import write_json
-    from gsx.experiments.runs.launched import ended_from_without, is_launched
-    from gsx.experiments.runs.multirun import job_place
-    from gsx.experiments.runs.settings import settings_from
-
     set_up_logging()
     folders: list[Path] = []
     place = job_place()
     try:
         with ended_from_without(place[0]) if place else nullcontext():
-            code = train(settings_from(config, loaded := plugins()), loaded, folders)
+            code = job.train(settings_from(config, loaded := plugins()), loaded, folders)
     except KeyboardInterrupt:
         if not is_launched():
             raise
         code = INTERRUPTED
     except (GsxError, OSError) as error:
-        code = explained(error)
-    except Exception:  # a defect, perhaps a plugin's: the other jobs are worth no less
+        code = report_error(error)
+    except Exception:  # a defect, perhaps of a plugin, must not end the other jobs
         logger.exception("this job failed")
         code = 1
     if place is not None:
@@ -155,34 +141,19 @@ def sweep_job(config: Any) -> int:
     return print_report(code, *folders)
 
 
-def verb_resume(arguments: list[str]) -> int:
-    """gsx resume RUN [KEY=VALUE ...] [--trust] [--changed]"""
-    description = (
-        "Go on where a run stopped, bit for bit; iterations=N lengthens it. --trust: also with code that RUN names. "
-        "--changed: also where cameras or config.yaml are no longer what it began with."
-    )
-    words = [word for word in arguments if word not in RESUME_FLAGS]
-    folder, overrides = run_arguments("resume", words, description, "".join(f" [{flag}]" for flag in RESUME_FLAGS))
-    with loading():
-        from gsx.engine.cache import in_use
-        from gsx.experiments.run_folder.claims import claimed
-        from gsx.experiments.run_folder.files import read_run, reported, state_of
-        from gsx.experiments.runs.history import go_on
-        from gsx.experiments.runs.open import open_run, refuse_other
-        from gsx.experiments.runs.saved_settings import write_config
-
-    loaded = plugins()
+def resume(options: Namespace) -> int:
+    """Continue a run and print its report; raise InputError if it is complete or past its iterations."""
+    folder, loaded = options.run, plugins()
     refuse_other(folder)
     with in_use(), claimed(folder) if speaks() else nullcontext():
-        run, settings = open_run(folder, loaded, overrides, training=True, trusted="--trust" in arguments)
+        run, settings = open_run(folder, loaded, options.overrides, training=True, trusted=options.trust)
         if run.step > run.iterations:
             less = f"iterations={run.iterations} is less: give iterations=N with N above {run.step}"
-            raise InputError(f"{folder} has come to step {run.step}, and {less}")
+            raise InputError(f"{folder} is at step {run.step}, {less}")
         if run.complete and reported(folder) and state_of(read_run(folder))[0] == "ok":
-            remedy = "give iterations=N with N above that to lengthen it"
-            raise InputError(f"{folder} is complete at step {run.step}: {remedy}")
+            raise InputError(f"{folder} is complete at step {run.step}: give iterations=N with a larger N to train on")
         if run.ranks.first:
-            go_on(run, settings, loaded, changed="--changed" in arguments)
+            record_changes(run, settings, loaded, changed=options.changed)
             write_config(folder / "config.yaml", settings.resolved)
         logger.info("resuming %s at step %d", folder, run.step)
-        return print_report(carry_out(run, settings, loaded), folder)
+        return print_report(job.carry_out(run, settings, loaded), folder)

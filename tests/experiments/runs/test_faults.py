@@ -303,13 +303,13 @@ def test_a_damaged_photograph_is_told_before_a_folder_exists(
 )
 def test_a_sidecar_with_numbers_of_no_step_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
     """The digest is that of the tensors: numbers beside it are looked at by themselves."""
-    from gsx.core.files import step_of
-    from gsx.experiments.run_folder.checkpoint import sound
+    from gsx.core.training.checkpoint_files import step_of
+    from gsx.experiments.run_folder.checkpoint import is_valid
 
     sidecar = tmp_path / "step_0000004.json"
     meta = {"step": 4, "seconds": 0.5, "orders": 1, "sampler": [0, 1], "views": {"train": ["a", "b"], "test": ["c"]}}
-    assert sound(meta, step_of(sidecar))
-    assert not sound(meta | change, step_of(sidecar))
+    assert is_valid(meta, step_of(sidecar))
+    assert not is_valid(meta | change, step_of(sidecar))
 
 
 def test_other_files_beside_checkpoints_are_none(tmp_path: Path) -> None:

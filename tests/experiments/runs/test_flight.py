@@ -91,7 +91,7 @@ def test_what_cannot_be_drawn_is_done_without_and_what_cannot_be_written_ends_th
 
     monkeypatch.setattr(evaluation, "add_depth", fails)
     with nullcontext() if told else pytest.raises(InputError, match="disk full"):
-        evaluation.embellish(None, None, SimpleNamespace(tile_pixels=1, flight=True))
+        evaluation.add_depth_and_flight(None, None, SimpleNamespace(tile_pixels=1, flight=True))
     assert ("no depth or flight" in caplog.text) is told
 
 

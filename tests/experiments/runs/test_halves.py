@@ -27,7 +27,7 @@ from gsx.core.training.sampler import Sampler
 from gsx.core.training.trainer import train_step
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.execute import execute
-from gsx.experiments.runs.halves import held_out_renders, without
+from gsx.experiments.runs.halves import half_run, held_out_renders
 from gsx.experiments.runs.open import open_run
 from gsx.modules.blur import Blur, BlurOptions
 
@@ -111,7 +111,7 @@ def test_a_half_sees_its_views_in_one_way(tmp_path: Path) -> None:
         asked.append(resolution)
         return run.backbone
 
-    half = without(run, anew, 0, 10, 3)
+    half = half_run(run, anew, 0, 10, 3)
     assert asked == [half.views]
     assert half.modules["blur"].movements == run.modules["blur"].movements
 

@@ -16,7 +16,7 @@ from gsx.core.errors import InputError
 from gsx.core.files import read_json
 from gsx.experiments.run_folder.files import read_run
 from gsx.experiments.runs.environment import camera_digest
-from gsx.experiments.runs.history import go_on
+from gsx.experiments.runs.history import record_changes
 from gsx.experiments.runs.open import open_run
 
 
@@ -49,7 +49,7 @@ def warned(caplog: pytest.LogCaptureFixture) -> list[str]:
 def resumed(run: Path, *overrides: str, changed: bool = False) -> None:
     """What `gsx resume` does before the first step."""
     opened, settings = open_run(run, plugins(), overrides, training=True)
-    go_on(opened, settings, plugins(), changed)
+    record_changes(opened, settings, plugins(), changed)
 
 
 def test_nothing_changed_nothing_said(run: Path, caplog: pytest.LogCaptureFixture) -> None:

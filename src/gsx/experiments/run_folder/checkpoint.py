@@ -1,8 +1,8 @@
 """Checkpoints: safetensors and a JSON sidecar with its sha256, written atomically, no pickle.
 
-A checkpoint holds everything a resumed run needs to continue bit for bit. The sidecar is written last: a checkpoint
-without one does not exist. A damaged checkpoint is named, and the one before it is used; one that this process may not
-read, or of another gsx, is not damaged, and nobody goes on from an older one.
+A checkpoint holds everything that a resumed run needs to continue with the same bits. The sidecar is written last: a
+checkpoint without one does not exist. A damaged checkpoint is skipped with a warning. One that this process may not
+read, or of another schema, is an error instead: training on from an older one would overwrite it.
 """
 
 import hashlib
@@ -23,11 +23,11 @@ logger = logging.getLogger(__name__)
 SCHEMA = 1
 GENERATOR = "run.generator"
 LONGEST = 1e12
-"""Seconds that no training takes."""
+"""Upper limit of training time in seconds."""
 
 
 def save(run: Run) -> Path:
-    """Write the checkpoint of the current step and drop all but the newest `training.checkpoints_kept`."""
+    """Write the checkpoint of the current step and remove all but the newest `training.checkpoints_kept`."""
     folder = run.folder / "checkpoints"
     folder.mkdir(parents=True, exist_ok=True)
     path = write(run, folder)
@@ -54,8 +54,8 @@ def write(run: Run, folder: Path) -> Path:
         "step": run.step,
         "seconds": run.progress.seconds,
         "sampler": run.sampler.order,
-        "orders": run.sampler.orders,
-        "views": names_of(run),
+        "orders": run.sampler.begun,
+        "views": view_names(run),
         "origin": run.scene.origin,
         "sha256": hashlib.sha256(data).hexdigest(),
     }
@@ -63,29 +63,18 @@ def write(run: Run, folder: Path) -> Path:
     return path
 
 
-def names_of(run: Run) -> dict[str, list[str]]:
-    """Names of the training and test views: a run goes on with these or not at all."""
+def view_names(run: Run) -> dict[str, list[str]]:
+    """Return the names of training and test views: a run continues only with the same."""
     return {"train": [v.name for v in run.scene.train], "test": [v.name for v in run.scene.test]}
 
 
-def refuse_other_views(run: Run, trained: dict[str, list[str]]) -> None:
-    """Raise CheckpointError if the scene now has other views, or splits them otherwise, than when it was trained."""
-    for part, names in names_of(run).items():
-        if names != trained[part]:
-            changed = sorted(set(names) ^ set(trained[part]))
-            raise CheckpointError(
-                f"{run.folder} was trained with other {part} views (now {len(names)}, then {len(trained[part])}; "
-                f"first difference: {changed[0] if changed else 'their order'}): restore the scene and its split"
-            )
-
-
 def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Sidecar and tensors of one checkpoint.
+    """Return sidecar and tensors of one checkpoint.
 
     Raises:
         CheckpointError: it is missing, truncated, altered, or not what gsx writes.
         InputError: it is of another schema.
-        OSError: this process may not read it, or cannot now, which says nothing of it.
+        OSError: this process may not read it, or cannot read it now.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load as from_bytes
@@ -94,33 +83,33 @@ def read(sidecar: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     try:
         meta, data = read_json(sidecar), path.read_bytes()
     except (FileNotFoundError, ValueError) as error:
-        raise CheckpointError(f"checkpoint {path} cannot be read ({error}): remove it to use an older one") from error
+        raise unusable(path, f"cannot be read ({error})") from error
     if not isinstance(meta, dict):
-        raise CheckpointError(f"checkpoint {sidecar} holds no JSON object: remove it to use an older one")
-    refuse_other_schema(meta, path)
-    refuse_lfs_pointer(path)
-    if hashlib.sha256(data).hexdigest() != meta.get("sha256"):
-        raise CheckpointError(f"checkpoint {path} is truncated or altered: remove it to use an older one")
-    if meta.get("schema") != SCHEMA or not sound(meta, step_of(sidecar)):
-        raise CheckpointError(f"checkpoint {sidecar} is not what gsx writes: remove it to use an older one")
-    try:
-        return meta, from_bytes(data)
-    except SafetensorError as error:
-        raise CheckpointError(f"checkpoint {path} cannot be read ({error}): remove it to use an older one") from error
-
-
-def refuse_other_schema(meta: dict[str, Any], path: Path) -> None:
-    """Raise InputError for a checkpoint of another gsx."""
+        raise unusable(sidecar, "holds no JSON object")
     schema = meta.get("schema")
     if isinstance(schema, int) and schema != SCHEMA:
         raise InputError(
             f"checkpoint {path} has schema {schema}, this gsx reads schema {SCHEMA}: use the version of gsx named in "
             "the run's environment.json, or move the checkpoint away to use an older one"
         )
+    refuse_lfs_pointer(path)
+    if hashlib.sha256(data).hexdigest() != meta.get("sha256"):
+        raise unusable(path, "is truncated or altered")
+    if schema != SCHEMA or not is_valid(meta, step_of(sidecar)):
+        raise unusable(sidecar, "is not what gsx writes")
+    try:
+        return meta, from_bytes(data)
+    except SafetensorError as error:
+        raise unusable(path, f"cannot be read ({error})") from error
 
 
-def sound(meta: dict[str, Any], step: int) -> bool:
-    """Whether a sidecar has the form that `write` gives that of a step."""
+def unusable(path: Path, problem: str) -> CheckpointError:
+    """Return the error for a damaged checkpoint."""
+    return CheckpointError(f"checkpoint {path} {problem}: remove it to use an older one")
+
+
+def is_valid(meta: dict[str, Any], step: int) -> bool:
+    """Return True if a sidecar has the form that `write` gives that of a step."""
     views, order = meta.get("views"), meta.get("sampler")
     if not (isinstance(views, dict) and isinstance(order, list)):
         return False
@@ -132,12 +121,12 @@ def sound(meta: dict[str, Any], step: int) -> bool:
 
 
 def is_list_of(kind: type, value: Any) -> bool:
-    """Whether it is a list of such values alone."""
+    """Return True for a list with values of that type only."""
     return isinstance(value, list) and all(isinstance(one, kind) for one in value)
 
 
 def newest(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor], list[Path]]:
-    """The newest undamaged checkpoint of a run folder, and the newer ones that are damaged; these are named in the log.
+    """Return sidecar and tensors of a run's newest undamaged checkpoint, and the sidecars of newer damaged ones.
 
     Raises:
         CheckpointError: there is none.
@@ -158,16 +147,11 @@ def newest(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor], list[Path]]
     raise CheckpointError(f"{folder} holds no checkpoint: give the folder of a run (a splat file is no checkpoint)")
 
 
-def taken_out(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Those whose names begin so, without that beginning; they are in the others no more."""
-    return {name.removeprefix(prefix): tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
-
-
 def restore(run: Run, training: bool = False) -> None:
     """Bring a freshly built run to the state of its newest checkpoint.
 
-    Where it is to go on (`training`), newer ones that were read and found damaged are set aside: they must not outlive
-    good ones. Who only looks changes nothing: what it cannot read may be another process's, half written.
+    training: rename newer damaged checkpoints, which must not outlive good ones. Without it nothing is changed: they
+    may be half-written files of another process.
 
     Raises:
         CheckpointError: there is no usable one, or it is of a run with other views or options.
@@ -178,12 +162,28 @@ def restore(run: Run, training: bool = False) -> None:
     try:
         run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
     except (KeyError, RuntimeError, TypeError) as error:
-        raise CheckpointError(f"a checkpoint of {run.folder} has no random numbers to go on with ({error})") from error
+        raise CheckpointError(f"a checkpoint of {run.folder} has no random state ({error})") from error
     for prefix, module in run.modules.items():
-        module.load_state_dict(taken_out(tensors, f"{prefix}."))
-    run.backbone.table = restore_table(run.backbone.table, tensors)
+        module.load_state_dict(pop_prefixed(tensors, f"{prefix}."))
+    run.backbone.table = restored_table(run.backbone.table, tensors)
     run.step, run.progress.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])
-    run.sampler.orders = meta.get("orders", -(-run.step // run.sampler.count))  # gsx before orders were counted
+    run.sampler.begun = meta.get("orders", -(-run.step // run.sampler.count))  # older runs do not count orders
     for sidecar in damaged if training and run.ranks.first else ():
         sidecar.rename(sidecar.with_suffix(".damaged"))
+
+
+def refuse_other_views(run: Run, trained: dict[str, list[str]]) -> None:
+    """Raise CheckpointError if the scene has other views, or splits them otherwise, than during training."""
+    for part, names in view_names(run).items():
+        if names != trained[part]:
+            changed = sorted(set(names) ^ set(trained[part]))
+            raise CheckpointError(
+                f"{run.folder} was trained with other {part} views (now {len(names)}, then {len(trained[part])}; "
+                f"first difference: {changed[0] if changed else 'their order'}): restore the scene and its split"
+            )
+
+
+def pop_prefixed(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Remove the tensors whose names have a prefix; return them without it."""
+    return {name.removeprefix(prefix): tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}

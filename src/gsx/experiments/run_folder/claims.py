@@ -1,11 +1,11 @@
-"""Claims of run folders: one process at a time trains or evaluates there; a lock file says which."""
+"""Claims of run folders: one process at a time trains or evaluates there; a lock file names it."""
 
 import json
 import logging
 import os
 import platform
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import IO
@@ -22,39 +22,38 @@ TRIES = 20
 """Attempts to open a lock file that its holder removes meanwhile."""
 
 
-@contextmanager
-def claimed(folder: Path) -> Iterator[None]:
-    """Claims a folder for this process; the claim of a killed process is void.
-
-    A file system without locks is only warned of.
+def claimed(folder: Path) -> AbstractContextManager[None]:
+    """Claim a folder for this process; the claim of a killed process is void. Without locks of the file system: warn.
 
     Raises:
         InputError: another process has claimed it.
     """
-    with held(folder / LOCK, folder):
-        yield
+    return held(folder / LOCK, folder)
 
 
-@contextmanager
-def claimed_name(folder: Path) -> Iterator[None]:
-    """Claims a folder that may have to be made or moved away, by a lock beside it.
+def claimed_name(folder: Path) -> AbstractContextManager[None]:
+    """Claim a folder that may have to be made or moved away, by a lock next to it.
 
     Raises:
         InputError: another process has claimed it, or the file system has no locks.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with held(folder.parent / f".{folder.name}{LOCK}", folder, needed=True):
-        yield
+    return held(name_lock(folder), folder, needed=True)
+
+
+def name_lock(folder: Path) -> Path:
+    """Return the lock file next to a folder."""
+    return folder.parent / f".{folder.name}{LOCK}"
 
 
 def left_behind(folder: Path) -> bool:
-    """Tells whether there is a lock file of a folder: a process works in it, or was killed there."""
-    return (folder / LOCK).exists() or (folder.parent / f".{folder.name}{LOCK}").exists()
+    """Return True if there is a lock file of a folder: a process works in it, or was killed there."""
+    return (folder / LOCK).exists() or name_lock(folder).exists()
 
 
 @contextmanager
 def held(path: Path, folder: Path, needed: bool = False) -> Iterator[None]:
-    """Holds a lock file that says who works in the folder, and removes it at the end."""
+    """Hold a lock file that names this process, and remove it at the end."""
     with locked(path, folder, needed) as stream:
         stream.truncate(0)
         since = datetime.now().isoformat(sep=" ", timespec="seconds")
@@ -63,12 +62,12 @@ def held(path: Path, folder: Path, needed: bool = False) -> Iterator[None]:
         try:
             yield
         finally:
-            with suppress(OSError):  # Windows keeps what is open
+            with suppress(OSError):  # Windows does not remove open files
                 path.unlink()
 
 
 def locked(path: Path, folder: Path, needed: bool) -> IO[str]:
-    """Opens and locks the lock file; opens it again if its last holder removed it meanwhile.
+    """Open and lock the lock file; open it again if its last holder removed it meanwhile.
 
     Raises:
         InputError: another process has it, it cannot be opened, or locks are `needed` and the file system has none.
@@ -97,11 +96,7 @@ def locked(path: Path, folder: Path, needed: bool) -> IO[str]:
 
 
 def opened(path: Path, folder: Path) -> IO[str]:
-    """Opens the lock file with its content, or makes it; follows no link.
-
-    Raises:
-        InputError: it cannot be opened.
-    """
+    """Open the lock file with its content, or make it; follow no link; raise InputError if that fails."""
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
     try:
         return os.fdopen(os.open(path, flags, 0o666), "r+", encoding="utf-8")
@@ -113,7 +108,7 @@ def opened(path: Path, folder: Path) -> IO[str]:
 
 
 def owner(path: Path) -> str:
-    """Names the user whose file or folder it is."""
+    """Return the user that owns a file or its folder."""
     try:
         return (path if path.exists() else path.parent).owner()
     except (OSError, KeyError, NotImplementedError):
@@ -121,7 +116,7 @@ def owner(path: Path) -> str:
 
 
 def is_at(path: Path, stream: IO[str]) -> bool:
-    """Tells whether an open file is the one at a path."""
+    """Return True if an open file is still the one at a path."""
     try:
         return os.path.samestat(os.fstat(stream.fileno()), path.stat())
     except FileNotFoundError:
@@ -129,10 +124,10 @@ def is_at(path: Path, stream: IO[str]) -> bool:
 
 
 def holder(stream: IO[str]) -> str:
-    """Describes the holder of a lock file."""
+    """Describe the holder of a lock file."""
     try:
         stream.seek(0)
         content = json.load(stream)
         return f"process {content['process']} on {content['host']} since {content['since']}"
-    except (OSError, ValueError, TypeError, KeyError):  # Windows does not let others read it
+    except (OSError, ValueError, TypeError, KeyError):  # on Windows others cannot read it
         return "another process"

@@ -19,16 +19,16 @@ DETAIL_OF = ("render", "enlarged", "photograph")
 """Pictures of a zoom whose explained detail is measured, the model's render first."""
 SPLATS = "point_cloud.ply"
 RESULTS = ("evaluation.json", "renders/index.json", SPLATS)
-"""Files that end every run; `gsx eval` makes them again."""
-BEGUN, LOG = ("environment.json", "metrics.jsonl"), "log.txt"
-"""Files that a run begins with."""
+"""Files that end every run; `gsx eval` writes them again."""
+FIRST_FILES, LOG = ("environment.json", "metrics.jsonl"), "log.txt"
+"""Files that a run starts with."""
 COMPACT = "compact.json"
-"""In a folder that `gsx compact` made, which has no log, and the others of BEGUN if it was made from a run."""
+"""File of a `gsx compact` run, which has no log; it has FIRST_FILES only if it was made from a run."""
 REPORT = "report.html"
 LOST = ("metrics.jsonl", "checkpoints/")
-"""Files that nothing makes again once a run is trained to its end."""
-ASIDE = "photographs/index.json"
-"""Optional: `gsx photographs` makes it again."""
+"""Files of a finished run that cannot be made again."""
+PHOTO_FINDINGS = "photographs/index.json"
+"""Optional: written by `gsx photographs`."""
 STATES = ("ok", "running", "interrupted", "failed", "corrupted")
 
 
@@ -53,39 +53,39 @@ class RunFiles:
     problems: dict[str, str]
     """Errors in words, by file."""
     namesake: int = 0
-    """Other scenes of the same name before this one, in a report over runs."""
+    """Number of other scenes of the same name before this one, in a report over runs."""
 
     @property
     def step(self) -> int:
-        """Returns the last step that any file mentions."""
+        """Return the last step that any file mentions."""
         logged = self.lines[-1]["step"] if self.lines else 0
         return max(int(self.status.get("step") or 0), evaluated_step(self), int(logged))
 
     @property
     def iterations(self) -> int:
-        """Returns the steps of the whole run; 0 where unknown."""
+        """Return the steps of the whole run; 0: unknown."""
         iterations = self.config.get("iterations")
         return int(iterations) if is_number(iterations) else 0
 
     @property
     def remedy(self) -> str:
-        """Returns the command that completes the run."""
-        only_results = not any(name.startswith((*self.begun, "checkpoints/")) for name in self.lacking)
+        """Return the command that completes the run."""
+        only_results = not any(name.startswith((*self.first_files, "checkpoints/")) for name in self.lacking)
         verb = "eval" if only_results and 0 < self.iterations <= self.step else "resume"
         return command(verb, self.folder)
 
     @cached_property
-    def begun(self) -> tuple[str, ...]:
-        """Returns the files that the run's beginning leaves."""
+    def first_files(self) -> tuple[str, ...]:
+        """Return the files that the start of the run leaves."""
         made = read_mapping(self.folder, COMPACT, {}, shapes.COMPACT)
         if not made:
-            return (*BEGUN, LOG)
-        return () if suffix_of(Path(made["from"])) else BEGUN
+            return (*FIRST_FILES, LOG)
+        return () if suffix_of(Path(made["from"])) else FIRST_FILES
 
     @cached_property
     def missing(self) -> list[str]:
-        """Returns the files of a complete run that are not there, except the report, which is made of them."""
-        names = [*self.begun, *RESULTS, *pictures_in(self.pictures), "status.json"]
+        """Return the missing files of a complete run, except the report, which is made of them."""
+        names = [*self.first_files, *RESULTS, *pictures_in(self.pictures), "status.json"]
         step = max(newest_checkpoint(self.folder), evaluated_step(self))
         if self.evaluation:
             names += [f"checkpoints/step_{step:07d}{suffix}" for suffix in (".safetensors", ".json")]
@@ -93,9 +93,9 @@ class RunFiles:
 
     @cached_property
     def damaged(self) -> dict[str, str]:
-        """Returns the error of each damaged file: content of those that are read, sizes of the others."""
-        found = {name: problem for name, problem in self.problems.items() if name not in (*LOST, ASIDE)}
-        if self.iterations > 0 and not self.lines and "metrics.jsonl" in self.begun:
+        """Return the problem of each damaged file: by content for those that are read, by size for the others."""
+        found = {name: problem for name, problem in self.problems.items() if name not in (*LOST, PHOTO_FINDINGS)}
+        if self.iterations > 0 and not self.lines and "metrics.jsonl" in self.first_files:
             found["metrics.jsonl"] = "metrics.jsonl holds no line of the run"
         found[SPLATS] = splats_problem(self.folder / SPLATS)
         found["checkpoints/"] = checkpoint_problem(self.folder)
@@ -103,23 +103,23 @@ class RunFiles:
 
     @property
     def lacking(self) -> list[str]:
-        """Returns the files that are missing or damaged."""
+        """Return the missing or damaged files."""
         return [*self.missing, *self.damaged]
 
     @property
     def lost(self) -> list[str]:
-        """Returns the lacking files that nothing makes again."""
+        """Return the lacking files that cannot be made again."""
         return [name for name in self.lacking if name.startswith(LOST)]
 
     @property
     def unfinished(self) -> list[str]:
-        """Returns the lacking files that the run makes again when it goes on."""
+        """Return the lacking files that the run writes again when it is resumed."""
         resumable = not any(name.startswith("checkpoints/") for name in self.lacking)
         return [name for name in self.lacking if name in RESULTS or (resumable and name not in self.lost)]
 
     @property
     def scene(self) -> str:
-        """Returns the scene's name, with the last part of its folder."""
+        """Return the scene's name, with the last part of its folder."""
         node = part(self.config, "scene")
         number = f"({self.namesake + 1})" if self.namesake else ""
         words = (str(node.get("name", "?")), Path(str(node.get("path") or "")).name, number)
@@ -127,30 +127,30 @@ class RunFiles:
 
     @property
     def backbone(self) -> str:
-        """Returns the names of backbone and augmenters."""
+        """Return the names of backbone and augmenters."""
         names = [part(self.config, "backbone").get("name", "?"), *part(self.config, "augmenter")]
         return " + ".join(map(str, names))
 
     @property
     def variant(self) -> str:
-        """Returns the name that config.yaml gives the run, else backbone and augmenters."""
+        """Return the variant in config.yaml, else backbone and augmenters."""
         name = self.config.get("variant")
         return name if isinstance(name, str) and name else self.backbone
 
     @property
     def protocol_hash(self) -> str:
-        """Returns the hash of the evaluation protocol; empty without an evaluation."""
+        """Return the hash of the evaluation protocol; empty without an evaluation."""
         return str(part(self.evaluation, "protocol").get("hash", ""))
 
 
 def part(content: dict[str, Any], key: str) -> dict[str, Any]:
-    """Returns a mapping inside a mapping; empty where there is none."""
+    """Return a mapping inside a mapping; empty if there is none."""
     value = content.get(key)
     return value if isinstance(value, dict) else {}
 
 
 def evaluated_step(run: RunFiles) -> int:
-    """Returns the step that a run was evaluated at; 0: none."""
+    """Return the step that a run was evaluated at; 0: none."""
     return int(run.evaluation.get("step") or 0)
 
 
@@ -158,7 +158,7 @@ def evaluated_step(run: RunFiles) -> int:
 
 
 def read_run(folder: Path) -> RunFiles:
-    """Reads all that can be read of a run."""
+    """Read all readable content of a run."""
     problems: dict[str, str] = {}
     config, text = read_yaml(folder / "config.yaml", problems)
 
@@ -178,14 +178,14 @@ def read_run(folder: Path) -> RunFiles:
         evaluation=evaluation,
         pictures=read("renders/index.json", shapes.DRAWN),
         pseudo=read("pseudo/index.json", shapes.PSEUDO_VIEWS),
-        photographs=read(ASIDE, shapes.PHOTOGRAPHS),
+        photographs=read(PHOTO_FINDINGS, shapes.PHOTOGRAPHS),
         status=read("status.json", shapes.STATUS),
         problems=problems,
     )
 
 
 def read_yaml(path: Path, problems: dict[str, str]) -> tuple[dict[str, Any], str]:
-    """Reads the mapping and the text of a YAML file; empty where it is damaged."""
+    """Read the mapping and the text of a YAML file; empty if it is damaged."""
     import yaml
 
     try:
@@ -201,7 +201,7 @@ def read_yaml(path: Path, problems: dict[str, str]) -> tuple[dict[str, Any], str
 
 
 def read_mapping(folder: Path, name: str, problems: dict[str, str], shape: shapes.Shape) -> dict[str, Any]:
-    """Reads a JSON object; empty where the file is missing, damaged, or does not fit its shape."""
+    """Read a JSON object; empty if the file is missing, damaged, or does not fit its shape."""
     try:
         content = read_json(folder / name)
     except FileNotFoundError:
@@ -216,7 +216,7 @@ def read_mapping(folder: Path, name: str, problems: dict[str, str], shape: shape
 
 
 def read_lines(path: Path, problems: dict[str, str]) -> list[dict[str, Any]]:
-    """Reads the intact lines of metrics.jsonl in order of their steps; a killed run may have cut one short."""
+    """Read the intact lines of metrics.jsonl in order of their steps; a killed run may have cut one short."""
     if not path.is_file():
         return []
     lines = [parsed(text) for text in path.read_text(encoding="utf-8", errors="replace").splitlines()]
@@ -227,7 +227,7 @@ def read_lines(path: Path, problems: dict[str, str]) -> list[dict[str, Any]]:
 
 
 def parsed(text: str) -> Any:
-    """Parses a text as JSON; None where it is none."""
+    """Parse JSON; None if it is damaged."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -235,7 +235,7 @@ def parsed(text: str) -> Any:
 
 
 def pictures_in(index: dict[str, Any]) -> list[str]:
-    """Lists the pictures that a renders/index.json names, as files of the run folder."""
+    """List the pictures of a renders/index.json as files of the run folder."""
     entries = [*index.get("views", []), *index.get("zoom", [])]
     names = [name for entry in entries for name in part(entry, "files").values()]
     names += [index["flight"]["file"]] if "flight" in index else []
@@ -243,7 +243,7 @@ def pictures_in(index: dict[str, Any]) -> list[str]:
 
 
 def runs_below(folder: Path) -> Iterator[Path]:
-    """Yields folders with a config.yaml in order; searches nothing inside a run and follows no link back up."""
+    """Yield folders with a config.yaml in order; search nothing inside a run and follow no link back up."""
     for child in sorted(folder.iterdir()):
         if not child.is_dir() or child.name.startswith("."):
             continue
@@ -255,26 +255,23 @@ def runs_below(folder: Path) -> Iterator[Path]:
             yield from runs_below(child)
 
 
-# -- figures -----------------------------------------------------------------------------------------------------------
+# -- figures and state -------------------------------------------------------------------------------------------------
 
 
 def gain_of(entry: dict[str, Any], figure: str = "psnr") -> float | None:
-    """Subtracts the figure of the resized x1 render from that of the zoomed render; positive: closer to the truth."""
+    """Subtract the figure of the resized x1 render from that of the zoomed render; positive: closer to the truth."""
     render, enlarged = entry.get(figure), entry.get(f"enlarged_{figure}")
     return render - enlarged if is_number(render) and is_number(enlarged) else None
 
 
 def detail_share(entry: dict[str, Any], kind: str = "render") -> float | None:
-    """Returns the explained detail above the training Nyquist frequency of a picture at a zoom (DETAIL_OF)."""
+    """Return the explained detail above the training Nyquist frequency of a picture at a zoom (DETAIL_OF)."""
     share = part(part(entry, "detail"), kind).get("explained")
     return share if is_number(share) else None
 
 
-# -- state -------------------------------------------------------------------------------------------------------------
-
-
 def state_of(run: RunFiles, reporting: bool = False) -> tuple[str, str]:
-    """Returns one of STATES, and the reason where it is not `ok`; `reporting`: its report is about to be written."""
+    """Return one of STATES and, unless it is `ok`, the reason; `reporting`: its report is about to be written."""
     recorded = run.status.get("state")
     for name in ("config.yaml", "evaluation.json"):
         if name in run.problems:
@@ -291,24 +288,24 @@ def state_of(run: RunFiles, reporting: bool = False) -> tuple[str, str]:
     progress += f"evaluated at step {evaluated_step(run):,}" if run.evaluation else "not evaluated"
     if done:
         progress += f", without {', '.join(missing)}"
-    return ("running", f"under way or killed: {progress}") if recorded == "running" else ("interrupted", progress)
+    return ("running", f"running or killed: {progress}") if recorded == "running" else ("interrupted", progress)
 
 
 def is_evaluated(run: RunFiles) -> bool:
-    """Tells whether the last state of a run was evaluated."""
+    """Return True if the last state of a run was evaluated."""
     return bool(run.evaluation) and evaluated_step(run) >= max(run.step, run.iterations)
 
 
 def has_figures(run: RunFiles) -> bool:
-    """Tells whether a run is done, perhaps without files that nothing makes again, such as deleted checkpoints."""
+    """Return True if a run is done, perhaps without files that cannot be made again, such as deleted checkpoints."""
     if state_of(run)[0] == "ok":
         return True
-    sound = run.status.get("state") == "ok" and "config.yaml" not in run.problems
-    return sound and is_evaluated(run) and not run.unfinished
+    ended = run.status.get("state") == "ok" and "config.yaml" not in run.problems
+    return ended and is_evaluated(run) and not run.unfinished
 
 
 def reported(folder: Path) -> bool:
-    """Tells whether a run's report is of its last state, which is recorded before the report is written."""
+    """Return True if a run's report is newer than its status, which is written before the report."""
     try:
         return (folder / REPORT).stat().st_mtime_ns >= (folder / "status.json").stat().st_mtime_ns
     except OSError:

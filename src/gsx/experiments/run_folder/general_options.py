@@ -10,49 +10,40 @@ from gsx.formats.axis_names import AUTO, CHOICES, EXAMPLES
 from gsx.formats.suffixes import READABLE, suffix_of
 
 BEGINNINGS = ("scratch", "warm_start")
-"""Values of `init` that are no file; both train the same."""
+"""Values of `init` that are not a file; both train the same."""
 
 
 def splat_file(init: Any) -> Path | None:
-    """Returns the splat file that a value of `init` names; None: it names none."""
+    """Return the splat file that a value of `init` names, if any."""
     return None if init is None or init in BEGINNINGS else Path(str(init))
 
 
 @dataclass(frozen=True, kw_only=True)
 class GeneralOptions:
-    """Top-level values; conf/config.yaml gives them."""
+    """Top-level values; conf/config.yaml sets and explains them."""
 
     iterations: Steps
-    """0: what a splat file holds is evaluated as it is (`init`)."""
+    """0: evaluate the splat file of `init` as it is."""
     seed: Seed
     device: str = without_effect()
     output: str = without_effect()
     folder: str = without_effect()
     length: Steps = label(default=0)
-    """Iterations before a budget takes its share."""
+    """Iterations before the budget's share."""
     variant: str = label(default="")
-    """Name of the published method that is composed; empty for others."""
+    """Name of a published method; empty for others."""
     data_root: str = without_effect(default="")
-    """Where datasets lie."""
     reuse: bool = without_effect(default=False)
-    """Names the run's folder by its composition and trains nothing again that is finished there (`run_key`)."""
     init: str = without_effect(default="scratch")
-    """scratch; warm_start: branch from an earlier run; or a splat file to go on from, which counts in `run_key`."""
+    """scratch, warm_start, or a splat file, which counts in `run_key`."""
     axes: str = without_effect(default=AUTO)
     """Axes of the splat file of `init`: auto, or three letters, which count in `run_key`."""
     warm_start_at: Annotated[list[int], Range(1, MOST_STEPS)] = without_effect(default_factory=list)
-    """Steps at which states are kept for other runs; empty: where the paper's variants begin."""
     disk_cache_gb: Gigabytes = without_effect(default=20.0)
-    """Size of the cache that runs share: states, reconstructions, pictures, networks."""
-
     viewer: bool = without_effect(default=False)
-    """Shows the model in a browser during training."""
     viewer_host: str = without_effect(default="127.0.0.1")
-    """Address at which the viewer listens."""
     viewer_port: Annotated[int, Range(0, 65535)] = without_effect(default=8080)
-    """0: any free port."""
     viewer_share: Share = without_effect(default=0.25)
-    """Share of the time for the viewer's pictures."""
 
     def __post_init__(self) -> None:
         file = splat_file(self.init)

@@ -1,4 +1,4 @@
-"""Quick checks of splat files and checkpoints: whether they are as long as their headers say."""
+"""Quick checks of splat files and checkpoints: their length against their headers."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from gsx.formats.ply import length_of
 
 
 def splats_problem(path: Path) -> str:
-    """Describes what is wrong with the splat file of a run by its header; empty: nothing."""
+    """Describe what is wrong with a splat file by its header; empty: nothing."""
     try:
         with path.open("rb") as stream:
             length = length_of(stream.read(MOST_HEADER))
@@ -20,18 +20,18 @@ def splats_problem(path: Path) -> str:
 
 
 def newest_checkpoint(folder: Path) -> int:
-    """Returns the step of a run's newest checkpoint; -1: it has none."""
-    from gsx.core.files import sidecars, step_of
+    """Return the step of a run's newest checkpoint; -1: it has none."""
+    from gsx.core.training.checkpoint_files import sidecars, step_of
 
     return max(map(step_of, sidecars(folder / "checkpoints")), default=-1)
 
 
 def checkpoint_problem(folder: Path) -> str:
-    """Describes what is wrong with a run's newest checkpoint by its sidecar and header; empty: nothing, or none."""
+    """Describe what is wrong with a run's newest checkpoint by its sidecar and header; empty: nothing, or none."""
     from safetensors import SafetensorError, safe_open
 
-    from gsx.core.files import sidecars, step_of
-    from gsx.experiments.run_folder.checkpoint import sound
+    from gsx.core.training.checkpoint_files import sidecars, step_of
+    from gsx.experiments.run_folder.checkpoint import is_valid
 
     for sidecar in sidecars(folder / "checkpoints")[-1:]:
         tensors = sidecar.with_suffix(".safetensors")
@@ -43,6 +43,6 @@ def checkpoint_problem(folder: Path) -> str:
             return ""
         except (OSError, ValueError, SafetensorError) as error:
             return f"checkpoint {tensors.name} cannot be read ({error})"
-        if not (isinstance(meta, dict) and sound(meta, step_of(sidecar))):
+        if not (isinstance(meta, dict) and is_valid(meta, step_of(sidecar))):
             return f"checkpoint {sidecar.name} is not what gsx writes"
     return ""

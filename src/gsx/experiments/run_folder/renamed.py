@@ -1,4 +1,4 @@
-"""Keys of configurations that were renamed, moved or removed: run folders hold the old ones, people type them."""
+"""Configuration keys that were renamed, moved or removed: run folders hold the old ones, and users type them."""
 
 import copy
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ MOVED = {
     "training.supersample": "training.supersampling.factor",
     "training.supersample_from": "training.supersampling.start",
 }
-"""New dotted keys by the old ones, of which digests of compositions are still made (`run_key`)."""
+"""New dotted keys by old ones; digests of compositions still use the old ones (`run_key`)."""
 RENAMED = MOVED | {
     "trunk_at": "warm_start_at",
     "backbone.rates.sh_constant": "backbone.rates.sh_dc",
@@ -25,11 +25,11 @@ REMOVED: dict[str, Any] = {
     "training.cuda_graphs": None,
     "rasterizer.exponent": "squares",
 }
-"""Keys without a successor, each with the value by which gsx still trains; None: the key changed no result."""
+"""Keys without a successor, each with the value that gsx still trains by; None: the key changed no result."""
 
 
 def renamed(config: dict[str, Any]) -> dict[str, Any]:
-    """Returns a copy with today's keys; a removed one stays where its value is not what gsx trains by."""
+    """Return a copy with today's keys; a removed key stays if its value is not what gsx trains by."""
     config, values = copy.deepcopy(config), flattened(config)
     for key, value in REMOVED.items():
         if value is None or values.get(key, MISSING) == value:
@@ -38,7 +38,7 @@ def renamed(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def moved(config: dict[str, Any], places: Mapping[str, str]) -> dict[str, Any]:
-    """Returns a copy with values at other dotted keys, by the keys where they are."""
+    """Return a copy with values moved to other dotted keys; `places`: new by old."""
     config = copy.deepcopy(config)
     for old, new in places.items():
         if (value := take(config, old)) is not MISSING:
@@ -47,7 +47,7 @@ def moved(config: dict[str, Any], places: Mapping[str, str]) -> dict[str, Any]:
 
 
 def take(config: dict[str, Any], key: str) -> Any:
-    """Removes a dotted key and the mappings that it leaves empty; returns its value, MISSING if there is none."""
+    """Remove a dotted key and the mappings that it leaves empty; return its value or MISSING."""
     name, _, inner = key.partition(".")
     if not inner or not isinstance(config.get(name), dict):
         return MISSING if inner else config.pop(name, MISSING)
@@ -58,7 +58,7 @@ def take(config: dict[str, Any], key: str) -> Any:
 
 
 def put(config: dict[str, Any], key: str, value: Any) -> None:
-    """Sets the value of a dotted key, and makes the mappings that it lies in."""
+    """Set the value of a dotted key; make the mappings around it."""
     *outer, last = key.split(".")
     for name in outer:
         config = config.setdefault(name, {})
@@ -66,7 +66,7 @@ def put(config: dict[str, Any], key: str, value: Any) -> None:
 
 
 def advice(key: str) -> str:
-    """Returns what to do about a key of older versions: ` It is now called 'x'.`; empty for other keys."""
+    """Return a remedy for a key of older versions: ` It is now called 'x'.`; empty for other keys."""
     if key in RENAMED:
         return f" It is now called '{RENAMED[key]}'."
     return " It has been removed: leave it out." if key in REMOVED else ""

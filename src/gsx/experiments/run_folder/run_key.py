@@ -1,4 +1,4 @@
-"""Identity of a run: one name for one training, wherever and however it is carried out."""
+"""Identity of a run: one name for one training, on any machine and in any folder."""
 
 import re
 from collections.abc import Collection
@@ -16,22 +16,19 @@ from gsx.formats.axis_names import AUTO
 from gsx.formats.suffixes import META
 
 WHERE = (*sorted(fields_with("none", GeneralOptions)), "tracker")
-"""Keys that say where and how a run is carried out."""
+"""Keys for place and manner of a run."""
 NAMES = (*sorted(fields_with("label", GeneralOptions)), "budget", "dataset")
-"""Keys that name what other keys hold."""
+"""Keys that name the values of other keys."""
 EVALUATION = ("eval", "metrics")
-"""Keys that matter after training alone."""
+"""Keys that matter only after training."""
 PICTURES = (".webp", ".png")
 """Suffixes of an unbundled SOG's pictures."""
 UNCHANGED = {"scene.model": "auto"}
-"""Keys added after runs were named, with the values that train the same: these do not count."""
+"""Keys newer than the first digests, with their neutral values, which do not count."""
 
 
 def trained(config: dict[str, Any], idle: Collection[str]) -> dict[str, Any]:
-    """Selects what of a resolved composition decides the training, apart from the scene's files (`scene_stamp`).
-
-    `idle`: dotted keys without effect.
-    """
+    """Select the values that decide the training, except the scene's files (`scene_stamp`); `idle`: other keys."""
     counted = without(config, {*idle, *unchanged(config)})
     kept = {key: value for key, value in counted.items() if key not in (*WHERE, *NAMES, *EVALUATION)}
     start = {"init": "splat file"} | axes_of(config) if splat_file(config.get("init")) else {}
@@ -39,47 +36,44 @@ def trained(config: dict[str, Any], idle: Collection[str]) -> dict[str, Any]:
 
 
 def unchanged(config: dict[str, Any]) -> list[str]:
-    """Lists the keys of a composition that have their value of UNCHANGED."""
+    """List the keys of a composition that have their value of UNCHANGED."""
     return [key for key, value in flattened(config).items() if UNCHANGED.get(key, ...) == value]
 
 
 def axes_of(config: dict[str, Any]) -> dict[str, Any]:
-    """Selects the axes of a composition's splat file, unless they are automatic."""
+    """Select the axes of a composition's splat file, unless they are automatic."""
     axes = config.get("axes", AUTO)
     return {} if axes == AUTO else {"axes": axes}
 
 
 def used_regenerators(config: dict[str, Any]) -> dict[str, Any]:
-    """Selects the regenerators of the augmenters' roles, or all where an augmenter does not name its role."""
+    """Select the regenerators of the augmenters' roles, or all if an augmenter does not name its role."""
     nodes = [node for node in part(config, "augmenter").values() if isinstance(node, dict)]
     roles = {node.get("role") for node in nodes}
     return {role: node for role, node in part(config, "regenerator").items() if roles & {role, None}}
 
 
 def without(node: Any, keys: Collection[str], prefix: str = "") -> Any:
-    """Copies a node without some dotted keys."""
+    """Copy a node without some dotted keys."""
     if not isinstance(node, dict):
         return node
     return {key: without(value, keys, f"{prefix}{key}.") for key, value in node.items() if f"{prefix}{key}" not in keys}
 
 
 def scene_stamp(config: dict[str, Any]) -> str:
-    """Digests the files of a composition's scene (names, sizes, contents) and of the splat file that it begins with.
-
-    Empty for scenes without a folder; `absent: FOLDER` where it is missing.
-    """
+    """Return a digest of a composition's scene and splat file; empty without any, `absent: FOLDER` if missing."""
     of_folder, file = folder_stamp(config), splat_file(config.get("init"))
     return content_key(of_folder, splat_stamp(file)) if file is not None and file.is_file() else of_folder
 
 
 def splat_stamp(file: Path) -> tuple[Any, ...]:
-    """Returns the stamp of a splat file, with the pictures of an unbundled SOG."""
+    """Return the stamp of a splat file, with the pictures of an unbundled SOG."""
     others = sorted(file.parent.iterdir()) if file.name.lower() == META else []
     return *file_stamp(file), *(file_stamp(other) for other in others if other.suffix.lower() in PICTURES)
 
 
 def folder_stamp(config: dict[str, Any]) -> str:
-    """Digests the folder of a composition's scene, and files outside of it that an option of the scene names."""
+    """Return a digest of a scene's folder, and of files outside of it that an option of the scene names."""
     scene = part(config, "scene")
     if not scene.get("path"):
         return ""
@@ -93,30 +87,30 @@ def folder_stamp(config: dict[str, Any]) -> str:
 
 
 def outside(scene: dict[str, Any], folder: Path) -> list[Path]:
-    """Lists files and folders outside of the scene's folder that its options name."""
+    """List files and folders outside of the scene's folder that its options name."""
     values = [value for key, value in scene.items() if key != "path" and isinstance(value, str)]
     leading = [value for value in values if Path(value).is_absolute() or value.startswith("..")]
     return [folder / value for value in leading if (folder / value).exists()]
 
 
 def trained_on(run: RunFiles) -> str:
-    """Returns the stamp of the scene when the run began."""
+    """Return the stamp of the scene at the start of the run."""
     return str(part(run.environment, "scene").get("stamp", ""))
 
 
 def other_revision(run: RunFiles, this: str) -> str:
-    """Returns the revisions of gsx's source that trained a run; empty if it is `this` one, or unknown."""
+    """Return the revisions of gsx's source that trained a run; empty if it is `this` one, or unknown."""
     revision = str(run.environment.get("source") or "")
     return "" if revision == this else revision
 
 
 def composition_key(config: dict[str, Any], stamp: str, idle: Collection[str]) -> str:
-    """Returns a short digest that is the same for compositions that train the same on a scene of that stamp."""
+    """Return a short digest, equal for compositions that train the same on a scene of that stamp."""
     return content_key(sorted_items(by_older_keys(trained(config, idle))), stamp)
 
 
 def by_older_keys(config: dict[str, Any]) -> dict[str, Any]:
-    """Returns a composition with the keys of the first digests, so that runs of before keep their names."""
+    """Return a composition with the keys of the first digests, so that older runs keep their names."""
     config = moved(config, {new: old for old, new in MOVED.items()})
     for key, value in REMOVED.items():
         if value is not None and key.partition(".")[0] in config:
@@ -125,7 +119,7 @@ def by_older_keys(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def sorted_items(value: Any) -> Any:
-    """Makes the text of a value independent of the order of keys, except that of augmenters."""
+    """Sort the keys of mappings, except those of augmenters, whose order counts."""
     if isinstance(value, dict):
         return [
             (key, [(name, sorted_items(node)) for name, node in inner.items()])
@@ -137,7 +131,7 @@ def sorted_items(value: Any) -> Any:
 
 
 def place_of(config: dict[str, Any], stamp: str, idle: Collection[str]) -> Path:
-    """Returns the folder of a composition with a scene of that stamp: <output>/<scene>/<backbone>/<digest>."""
+    """Return the folder of a composition with a scene of that stamp: <output>/<scene>/<backbone>/<digest>."""
     scene = part(config, "scene")
     name = Path(str(scene.get("path") or "")).name or str(scene.get("name"))
     backbone = str(part(config, "backbone").get("name"))
@@ -146,13 +140,13 @@ def place_of(config: dict[str, Any], stamp: str, idle: Collection[str]) -> Path:
 
 
 def evaluation_settings(config: dict[str, Any]) -> dict[str, Any]:
-    """Selects how a composition is evaluated; saved with every evaluation."""
+    """Select the values that decide an evaluation; saved with it."""
     render = {"filter": part(config, "backbone").get("filter"), "pixel": part(config, "rasterizer").get("pixel")}
     return {key: config.get(key) for key in EVALUATION} | render
 
 
 def finished(run: RunFiles, config: dict[str, Any], stamp: str, idle: Collection[str]) -> bool:
-    """Tells whether a run folder holds all of a composition: trained to the end on that scene, evaluated the same."""
+    """Return True if a run is trained to the end on that scene and evaluated by the same settings."""
     return (
         run.status.get("state") == "ok"
         and not run.unfinished
@@ -163,7 +157,7 @@ def finished(run: RunFiles, config: dict[str, Any], stamp: str, idle: Collection
 
 
 def comparable(config: dict[str, Any]) -> dict[str, Any]:
-    """Selects values by dotted key that runs may be compared by, leaving out where a run ran."""
+    """Select the values to compare runs by, by dotted key: all but place and manner."""
     kept = {key: value for key, value in config.items() if key not in (*WHERE, "length")}
     start = {"init": config["init"]} | axes_of(config) if splat_file(config.get("init")) else {}
     return flattened(without(kept | start, unchanged(config)))

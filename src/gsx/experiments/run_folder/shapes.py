@@ -1,29 +1,29 @@
-"""Shapes of the JSON files of a run folder: a file that does not fit counts as damaged."""
+"""Shapes of the JSON files in a run folder: a file that does not fit its shape counts as damaged."""
 
 from pathlib import Path
 from typing import Any, TypeAlias, TypeGuard
 
 LARGEST = 1e100
-"""Larger numbers occur in no run and are not safe to compute with."""
+"""Larger numbers do not occur in runs and are not safe to compute with."""
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """Recognises a finite number of a size that occurs in runs."""
+    """Recognise a finite number of a size that occurs in runs."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST <= value <= LARGEST
 
 
 def is_length(value: Any) -> bool:
-    """Recognises a number above 0."""
+    """Recognise a number above 0."""
     return is_number(value) and value > 0
 
 
 def is_number_or_null(value: Any) -> bool:
-    """Recognises a number or null."""
+    """Recognise a number or null."""
     return value is None or is_number(value)
 
 
 def is_decimal(word: str) -> bool:
-    """Recognises a key of JSON that spells a number."""
+    """Recognise a key of JSON that spells a number."""
     try:
         return is_number(float(word))
     except ValueError:
@@ -31,7 +31,7 @@ def is_decimal(word: str) -> bool:
 
 
 def is_file_name(name: Any) -> bool:
-    """Recognises a text that can name a file."""
+    """Recognise a text that can name a file."""
     return isinstance(name, str) and Path(name).name not in ("", "..")
 
 
@@ -52,7 +52,7 @@ LINE: Shape = {
     "test_psnr?": is_number_or_null,
     "pseudo?": {str: PSEUDO},
 }
-"""A line of metrics.jsonl, as far as a run that goes on reads it again."""
+"""A line of metrics.jsonl, as far as a resumed run reads it."""
 EVALUATION: Shape = {
     "step?": is_number_or_null,
     "views?": [{"name?": str}],
@@ -77,7 +77,7 @@ COMPACT: Shape = {"from": str}
 
 
 def fits(value: Any, shape: Shape) -> bool:
-    """Checks a value of JSON against a shape."""
+    """Check a value of JSON against a shape."""
     if isinstance(shape, type):
         return isinstance(value, shape)
     if isinstance(shape, list):
@@ -90,7 +90,7 @@ def fits(value: Any, shape: Shape) -> bool:
 
 
 def key_fits(content: dict[str, Any], key: Shape, shape: Shape) -> bool:
-    """Checks what a mapping has under a key of a shape."""
+    """Check what a mapping has under a key of a shape."""
     if not isinstance(key, str):
         return all(fits(name, key) and fits(inner, shape) for name, inner in content.items())
     name = key.removesuffix("?")

@@ -13,9 +13,9 @@ READ = 1 << 20
 
 
 def tree_stamp(place: Path, skip: Path) -> str:
-    """Digests a file, or all in a folder: relative names, sizes, contents or times of change; follows links.
+    """Return a digest of a file, or of all files in a folder by `stamp_of`; follow links.
 
-    Skips hidden names, unreadable files, folders of runs (they have a config.yaml) and the folder `skip`.
+    Hidden names, unreadable files, run folders (they have a config.yaml) and the folder `skip` do not count.
     """
     if not place.is_dir():
         return content_key(stamp_of(place.name, place))
@@ -23,11 +23,7 @@ def tree_stamp(place: Path, skip: Path) -> str:
 
 
 def stamp_of(name: str, path: Path) -> tuple[str, int, str | int]:
-    """Returns name, size in bytes, and the digest of the content, or above READ the modification time in ns.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Return name, size in bytes, and the digest of the content, or above READ the modification time in ns."""
     status = path.stat()
     if status.st_size > READ:
         return name, status.st_size, status.st_mtime_ns
@@ -35,7 +31,7 @@ def stamp_of(name: str, path: Path) -> tuple[str, int, str | int]:
 
 
 def stamps_below(folder: str, prefix: str, visited: set[str]) -> Iterator[tuple[str, int, str | int]]:
-    """Yields `stamp_of` each file in a folder in order, names with `prefix`."""
+    """Yield `stamp_of` each file in a folder in order, names with `prefix`."""
     visited.add(os.path.realpath(folder))
     entries = visible_entries(folder)
     for entry in [] if prefix and any(entry.name == "config.yaml" for entry in entries) else entries:
@@ -48,7 +44,7 @@ def stamps_below(folder: str, prefix: str, visited: set[str]) -> Iterator[tuple[
 
 
 def visible_entries(folder: str) -> list[os.DirEntry[str]]:
-    """Lists a folder in order without hidden names; nothing if it cannot be read."""
+    """List a folder in order without hidden names; nothing if it cannot be read."""
     try:
         with os.scandir(folder) as entries:
             return sorted((entry for entry in entries if not entry.name.startswith(".")), key=lambda entry: entry.name)

@@ -1,8 +1,8 @@
-"""A standard splat file for all views out of a model that decodes its splats anew for every camera.
+"""A standard splat file for all views, made from a model that decodes its splats anew for every camera.
 
 Each splat is followed over the training cameras. It keeps its mean opacity (0 where it is not drawn), its mean
-covariance, and harmonics fitted to the colours it is seen with; what it has of levels of detail is that of the cameras,
-as they are or zoomed. Least squares, weighted by opacity, with a ridge on the higher bands.
+covariance, and harmonics fitted to its colours by least squares, weighted by opacity, with a ridge on the higher
+bands. Its level of detail is that of the cameras, as they are or zoomed.
 """
 
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ from gsx.core.training.run import Run
 from gsx.formats.smoothing import logit_of_log
 
 DEGREE = 2
-"""Of the harmonics."""
+"""Degree of the harmonics."""
 RIDGE = 0.03
-"""In units of one camera that sees the splat at full opacity, times l (l + 1) for band l: smooth where few look."""
+"""Ridge in units of one camera that draws the splat at full opacity, times l (l + 1) for band l."""
 FAINTEST = 1 / 255
 """Splats of a lower mean opacity are left out: nothing draws them (3D-GS)."""
 MOST_CAMERAS = 200
@@ -33,11 +33,11 @@ MOST_CAMERAS = 200
 
 @dataclass(eq=False)
 class Sums:
-    """Sums over cameras for S splats."""
+    """Sums over cameras for S splats with B basis functions."""
 
     visits: Float[Tensor, "S"]
     weights: Float[Tensor, "S"]
-    """Opacities, added up."""
+    """Sums of opacities."""
     means: Float[Tensor, "S 3"]
     covariances: Float[Tensor, "S 3 3"]
     normal: Float[Tensor, "S B B"]
@@ -47,16 +47,13 @@ class Sums:
 
     @classmethod
     def of(cls, slots: int, device: torch.device) -> "Sums":
-        """Returns sums over no camera."""
+        """Return sums over no camera."""
         size = (DEGREE + 1) ** 2
-
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(slots, *shape, device=device)
-
-        return cls(zeros(), zeros(), zeros(3), zeros(3, 3), zeros(size, size), zeros(size, 3))
+        shapes = ((), (), (3,), (3, 3), (size, size), (size, 3))
+        return cls(*(torch.zeros(slots, *shape, device=device) for shape in shapes))
 
     def add(self, splats: Splats, slots: Int[Tensor, "M"], visited: Int[Tensor, "V"], camera: Camera) -> None:
-        """Adds what one camera draws; `visited`: what it could have drawn."""
+        """Add what one camera draws; `visited`: what it could have drawn."""
         weight = splats.log_opacities.exp()
         directions = normalize(offsets_from(splats.means, camera.centre), dim=1)
         basis = torch.cat([torch.full_like(weight[:, None], BAND_0), harmonics(directions, DEGREE)], 1)
@@ -70,7 +67,7 @@ class Sums:
         self.right.index_add_(0, slots, weighted[:, :, None] * (splats.colours - 0.5)[:, None])
 
     def gaussians(self) -> Gaussians:
-        """Returns the splats that are not too faint."""
+        """Return the splats that are not too faint."""
         opacity = self.weights / self.visits.clamp_min(1)
         kept = opacity >= FAINTEST
         weights = self.weights[kept]
@@ -89,23 +86,23 @@ class Sums:
 
 
 def principal_axes(covariances: Float[Tensor, "N 3 3"]) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
-    """Returns (standard deviations along the principal axes, rotations as quaternions) of covariance matrices."""
+    """Return (standard deviations along the principal axes, rotations as quaternions) of covariance matrices."""
     squares, axes = torch.linalg.eigh(covariances.double())
-    axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # a rotation, no mirror
+    axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # a rotation, not a reflection
     least = squares.amax(1, keepdim=True) * 1e-12
     return squares.maximum(least).clamp_min(1e-30).sqrt().float(), quaternions_of(axes).float()
 
 
 @torch.no_grad()
 def bake(run: Run, zoom: float = 1.0) -> Gaussians:
-    """Returns Gaussians for all views, as training cameras see them at `zoom` times their resolution.
+    """Return Gaussians for all views, as training cameras draw them at `zoom` times their resolution.
 
     Raises:
-        InputError: the backbone does not tell its splats apart, or no camera sees any.
+        InputError: the backbone has no identities of splats, or no camera draws any.
     """
     backbone = run.backbone
     if not isinstance(backbone, Bakeable):
-        raise InputError(f"backbone {run.config['backbone']['name']} cannot be baked: its splats have no names")
+        raise InputError(f"backbone {run.config['backbone']['name']} cannot be baked: its splats have no identity")
     sums = Sums.of(backbone.slot_count(), run.device)
     cameras = [view.camera for view in run.scene.train]
     count = min(len(cameras), MOST_CAMERAS)
@@ -114,5 +111,5 @@ def bake(run: Run, zoom: float = 1.0) -> Gaussians:
         drawn = backbone.draw(camera, run.model_step)
         sums.add(drawn.splats, *backbone.slots(drawn), camera)
     if not bool((sums.weights > 0).any()):
-        raise InputError("no training camera sees any splat of this model: there is nothing to bake")
+        raise InputError("no training camera draws any splat of this model: there is nothing to bake")
     return sums.gaussians()

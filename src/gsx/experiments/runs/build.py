@@ -30,16 +30,21 @@ from gsx.engine.joined_ranks import current_ranks
 from gsx.engine.machine import processor_kind
 from gsx.engine.threads import watch_cores
 from gsx.experiments.run_folder.general_options import splat_file
-from gsx.experiments.runs.halves import Anew, held_out_renders
+from gsx.experiments.runs.halves import NewBackbone, held_out_renders
 from gsx.experiments.runs.rasterizer_path import decide
 from gsx.experiments.runs.settings import Chosen, Settings
 from gsx.experiments.runs.start_file import in_front_of, one_point, start_from
 
 logger = logging.getLogger(__name__)
 
+ALONE = Ranks()
+
+
+# -- device and ranks --------------------------------------------------------------------------------------------------
+
 
 def choose_device(name: str) -> torch.device:
-    """auto: a GPU where there is one.
+    """Return the device that is named auto (a GPU if there is one), cpu or cuda.
 
     Raises:
         ConfigError: the name is unknown or the device absent.
@@ -47,23 +52,23 @@ def choose_device(name: str) -> torch.device:
     if name not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"device is '{name}'; choose auto, cpu or cuda")
     if name == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("device is cuda, but this torch finds no CUDA device: use device=cpu or device=auto")
+        raise ConfigError("device is cuda, but torch finds no CUDA device: use device=cpu or device=auto")
     return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")
 
 
 def placed(device: torch.device) -> torch.device:
-    """The device of this rank: of several GPUs each rank has its own.
+    """Return the device of this rank: each rank has its own GPU.
 
     Raises:
         ConfigError: there are fewer GPUs than ranks on this machine.
     """
     if device.type != "cuda" or current_ranks().size == 1:
         return device
-    own, count = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
-    if own >= count:
-        raise ConfigError(f"process {own} of this machine has no GPU, there are {count}: --nproc-per-node {count}")
-    torch.cuda.set_device(own)
-    return torch.device("cuda", own)
+    rank, count = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
+    if rank >= count:
+        raise ConfigError(f"process {rank} of this machine has no GPU, there are {count}: --nproc-per-node {count}")
+    torch.cuda.set_device(rank)
+    return torch.device("cuda", rank)
 
 
 def refuse_uneven(batch: int, ranks: Ranks) -> None:
@@ -76,7 +81,7 @@ def refuse_uneven(batch: int, ranks: Ranks) -> None:
 
 
 def refuse_shared(modules: Modules, ranks: Ranks) -> None:
-    """Raise ConfigError for a module that does not work with so many processes."""
+    """Raise ConfigError for a module that does not support so many processes."""
     for name, module in modules.items():
         if not module.supports(ranks.size):
             raise ConfigError(
@@ -85,55 +90,37 @@ def refuse_shared(modules: Modules, ranks: Ranks) -> None:
             )
 
 
-def build_modules(settings: Settings, scene: Scene, device: torch.device) -> Modules:
-    """Returns the training modules of a run, in the order of their registration."""
-    facts: dict[str, Any] = {"scene": scene, "device": device, "batch": settings.training.batch}
-    return {
-        name: chosen.component.factory(
-            chosen.options, ModuleContext(name=name, iterations=settings.general.iterations, **facts)
-        )
-        for name, chosen in settings.modules.items()
-    }
-
-
-ALONE = Ranks()
+# -- the process -------------------------------------------------------------------------------------------------------
 
 
 def prepare_process(device: torch.device, training: bool) -> None:
-    """Prepares the whole process: how memory is kept and counted, where compiled code lies, how threads wait."""
+    """Set up memory, threads, convolutions and compiling for the whole process."""
     watch_cores()
     if training and device.type == "cpu":
         keep_freed_memory()
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)  # of an earlier run in this process
         convolve_exactly()
-    prepare_compiling()
-
-
-def convolve_exactly() -> None:
-    """On a GPU convolutions of float32 are those of float32, not of the 10 bits that torch allows there, and add in the
-    same order each time: pictures are reduced by them, and regenerators learn by them."""
-    torch.backends.cudnn.conv.fp32_precision = "ieee"  # type: ignore[attr-defined]
-    torch.backends.cudnn.deterministic = True
-
-
-def prepare_compiling() -> None:
-    """What torch's compiler reads from the environment of this process, and of those that it starts."""
     keep_compiled_code()
     hasten_compiling()
 
 
+def convolve_exactly() -> None:
+    """Make convolutions on a GPU deterministic and of full float32 (torch allows 10 bits)."""
+    torch.backends.cudnn.conv.fp32_precision = "ieee"  # type: ignore[attr-defined]
+    torch.backends.cudnn.deterministic = True
+
+
 def hasten_compiling() -> None:
-    """Settings that torch's compiler reads from the environment when it is first needed."""
-    # torch would compile and load programs to see which vector registers there are: the system says so
+    """Set environment variables that torch's compiler reads when it is first needed."""
+    # torch would compile and load programs to find the vector registers: the system reports them
     os.environ.setdefault("TORCHINDUCTOR_VEC_ISA_OK", "1")
-    # remembering what each operation says of sizes and formats costs more than asking again where sizes are symbols
+    # caching sizes and formats of each operation costs more than computing them again where sizes are symbols
     os.environ.setdefault("TORCH_FAKE_TENSOR_DISPATCH_CACHE", "0")
 
 
 def keep_compiled_code() -> None:
-    """Have torch keep what it compiles in an entry of the cache, one for each kind of processor, of which there may be
-    several on a cluster: its own place is lost on restart. Where nothing can be written it stays with that.
+    """Keep what torch compiles in the cache, by kind of processor: torch's own place is lost on restart.
 
     Raises:
         InputError: there is no cache, for want of a home folder.
@@ -147,6 +134,9 @@ def keep_compiled_code() -> None:
         os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(folder))
 
 
+# -- the run -----------------------------------------------------------------------------------------------------------
+
+
 def build(
     settings: Settings,
     scene: Scene,
@@ -155,13 +145,13 @@ def build(
     start: Gaussians | None = None,
     begins: bool = True,
 ) -> Run:
-    """Everything of a run in memory, at step 0; `training`: it is to go on, with augmenters, and by the path of the
-    rasterizer that suits training. Looking at a run needs none of what its regenerators need. start: content of the
-    splat file that it begins with, if it does. begins: whether the model starts from the scene or a file; otherwise a
-    checkpoint is to take its place.
+    """Build a run in memory at step 0.
+
+    training: with augmenters, and with the rasterizer path that suits training. start: content of the splat file of
+    `init`. begins: the model starts from the scene or a file; otherwise a checkpoint will replace it.
 
     Raises:
-        ConfigError: the backbone cannot begin with a file.
+        ConfigError: the backbone cannot start from a file.
     """
     general, ranks = settings.general, current_ranks()
     device = placed(choose_device(general.device))
@@ -175,14 +165,14 @@ def build(
     if training:
         refuse_shared(views.modules, ranks)
 
-    anew = partial(backbone_of, settings.backbone, device, raster)
+    new_backbone = partial(backbone_of, settings.backbone, device, raster)
     if splat_file(general.init):
         stand_in = in_front_of(scene.train[0].camera)
         one = replace(scene, points=one_point(stand_in))
-        backbone = anew(one, general.iterations, generator, views, ranks, begins=False)
-        start_from(backbone, start or stand_in, settings.backbone.component.name)
+        backbone = new_backbone(one, general.iterations, generator, views, ranks, begins=False)
+        go_on_from(backbone, start or stand_in, settings.backbone.component.name)
     else:
-        backbone = anew(scene, general.iterations, generator, views, ranks, begins)
+        backbone = new_backbone(scene, general.iterations, generator, views, ranks, begins)
     return Run(
         config=settings.resolved,
         folder=folder,
@@ -194,9 +184,20 @@ def build(
         photos=PhotoCache(device, room_for_photos(device) if training else 0),
         generator=generator,
         sampler=Sampler(len(scene.train), general.seed, batch=settings.training.batch),
-        augmenters=build_augmenters(settings, scene, anew) if training else {},
+        augmenters=build_augmenters(settings, scene, new_backbone) if training else {},
         ranks=ranks,
     )
+
+
+def build_modules(settings: Settings, scene: Scene, device: torch.device) -> Modules:
+    """Build the training modules of a run, in the order of their registration."""
+    facts: dict[str, Any] = {"scene": scene, "device": device, "batch": settings.training.batch}
+    return {
+        name: chosen.component.factory(
+            chosen.options, ModuleContext(name=name, iterations=settings.general.iterations, **facts)
+        )
+        for name, chosen in settings.modules.items()
+    }
 
 
 def backbone_of(
@@ -210,7 +211,7 @@ def backbone_of(
     ranks: Ranks = ALONE,
     begins: bool = True,
 ) -> Backbone:
-    """The backbone that was chosen, at step 0 of so many; see `BackboneContext`."""
+    """Build the chosen backbone at step 0; see `BackboneContext`."""
     context = BackboneContext(
         scene=scene,
         iterations=iterations,
@@ -224,11 +225,11 @@ def backbone_of(
     return chosen.component.factory(chosen.options, context)
 
 
-def build_augmenters(settings: Settings, scene: Scene, anew: Anew) -> dict[str, Augmenter]:
-    """Builds the augmenters of a run, in order; they share regenerators by role.
+def build_augmenters(settings: Settings, scene: Scene, new_backbone: NewBackbone) -> dict[str, Augmenter]:
+    """Build the augmenters of a run, in order; they share regenerators by role.
 
     Raises:
-        ConfigError: together they replace the whole loss of the photographs.
+        ConfigError: together they replace the whole loss of the photos.
     """
     regenerator = cache(partial(regenerator_of, settings=settings))
     augmenters: dict[str, Augmenter] = {}
@@ -240,22 +241,18 @@ def build_augmenters(settings: Settings, scene: Scene, anew: Anew) -> dict[str, 
             seed=settings.general.seed,
             regenerator=regenerator,
             checks=settings.checks,
-            held_out=lambda run, share, seed: held_out_renders(run, anew, share, seed),
+            held_out=lambda run, share, seed: held_out_renders(run, new_backbone, share, seed),
         )
         augmenters[name] = chosen.component.factory(chosen.options, context)
     shares = {name: augmenter.share() for name, augmenter in augmenters.items() if isinstance(augmenter, Replacing)}
     if sum(shares.values()) >= 1:
         listed = ", ".join(f"{name} {share:g}" for name, share in shares.items())
-        raise ConfigError(f"augmenters take the whole loss of the photographs ({listed}): lower their weights")
+        raise ConfigError(f"augmenters replace the whole loss of the photos ({listed}): lower their weights")
     return augmenters
 
 
 def regenerator_of(role: str, settings: Settings) -> Regenerator:
-    """The regenerator chosen for a role.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """Build the regenerator of a role; raise ConfigError if none is chosen."""
     if role not in settings.regenerators:
         raise ConfigError(f"no regenerator is chosen for '{role}': add regenerator/{role}=NAME")
     chosen = settings.regenerators[role]
@@ -263,10 +260,10 @@ def regenerator_of(role: str, settings: Settings) -> Regenerator:
 
 
 def plan_of(run: Run) -> dict[str, Any]:
-    """The rescaled schedules of the backbone, of the loop and of the augmenters."""
-    own = run.backbone.plan() if isinstance(run.backbone, Planned) else {}
-    if not all(isinstance(part, Mapping) for part in own.values()):
-        own = {run.config["backbone"]["name"]: own}
+    """Return the rescaled schedules of backbone, modules and augmenters by name."""
+    plan = run.backbone.plan() if isinstance(run.backbone, Planned) else {}
+    if not all(isinstance(part, Mapping) for part in plan.values()):
+        plan = {run.config["backbone"]["name"]: plan}
     for module in run.modules.values():
-        own |= module.plan(run)
-    return own | {name: augmenter.plan() for name, augmenter in run.augmenters.items()}
+        plan |= module.plan(run)
+    return plan | {name: augmenter.plan() for name, augmenter in run.augmenters.items()}

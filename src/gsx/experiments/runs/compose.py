@@ -1,4 +1,4 @@
-"""From overrides to a composition, by Hydra; `config_files`, `overrides` and `multirun` are its other speakers."""
+"""From overrides to a composition, by Hydra; `config_files`, `overrides` and `multirun` use Hydra as well."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +18,7 @@ from gsx.core.files import expand_home
 from gsx.core.plugins import Plugins
 from gsx.experiments.runs.overrides import parse_overrides, refuse_absent_launcher, refuse_sweep, with_quoted_paths
 from gsx.experiments.runs.settings import Settings, settings_from
-from gsx.experiments.runs.typed import dotted, right_key
+from gsx.experiments.runs.typed import dotted, unknown_key
 
 NEWER = "replace" in signature(OmegaConf.register_resolver).parameters  # OmegaConf 2.4: an older function of this name
 register: Callable[..., None] = OmegaConf.register_resolver if NEWER else OmegaConf.register_new_resolver
@@ -32,7 +32,7 @@ MOST_KEPT = 16
 
 @contextmanager
 def hydra_session(plugins: Plugins) -> Iterator[None]:
-    """Initialises Hydra on the packaged configuration and the plugins' search paths, and clears it afterwards."""
+    """Initialise Hydra on the packaged configuration and the plugins' search paths, and clear it afterwards."""
     from hydra import initialize_config_module
     from hydra.core.global_hydra import GlobalHydra
 
@@ -45,7 +45,7 @@ def hydra_session(plugins: Plugins) -> Iterator[None]:
 
 
 def version_base() -> dict[str, str]:
-    """Returns the argument that keeps Hydra 1.3 to its own rules: newer ones warn of it, and have no other."""
+    """Return the argument that makes Hydra 1.3 follow its own rules: newer versions warn of it and have no others."""
     import hydra
 
     return {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}
@@ -77,47 +77,47 @@ class Compositions:
         self.session.__exit__(*error)
 
     def composed(self, overrides: Sequence[str]) -> DictConfig:
-        """Returns what `compose_raw` makes, once for equal overrides; callers must not change it."""
+        """Return the result of `compose_raw`, shared between equal overrides: callers must not change it."""
         return self.recent(tuple(overrides))
 
     def settings(self, overrides: Sequence[str]) -> Settings:
-        """Returns one composition, checked; see `compose`."""
+        """Return checked settings; see `compose`."""
         return settings_from(self.composed(overrides), self.plugins)
 
     def node(self, overrides: Sequence[str], key: str) -> dict[str, Any]:
-        """Returns one node of a composition as plain values, unchecked; empty where there is none."""
+        """Return one node as plain values, unchecked; empty if there is none."""
         node = OmegaConf.select(self.composed(overrides), key)
         return OmegaConf.to_container(node, resolve=True) if isinstance(node, DictConfig) else {}  # type: ignore
 
     def keys(self, overrides: Sequence[str]) -> list[str]:
-        """Returns the dotted keys of a composition."""
+        """Return the dotted keys of a composition."""
         return list(dotted(OmegaConf.to_container(self.composed(overrides), resolve=False)))
 
     def value(self, overrides: Sequence[str], key: str) -> Any:
-        """Returns one value of a composition."""
+        """Return one value."""
         return OmegaConf.select(self.composed(overrides), key)
 
     def values(self, overrides: Sequence[str]) -> Any:
-        """Returns a whole composition as plain values, unchecked."""
+        """Return a whole composition as plain values, unchecked."""
         return OmegaConf.to_container(self.composed(overrides), resolve=True)
 
     def sources(self, overrides: Sequence[str]) -> list[Source]:
-        """Returns the files that a composition is made of, in the order in which they are merged."""
+        """Return the files of a composition in the order of merging."""
         from hydra.core.global_hydra import GlobalHydra
         from hydra.types import RunMode
 
         loader = GlobalHydra.instance().config_loader()
         merged = loader.compute_defaults_list("config", list(overrides), RunMode.RUN).defaults
         files = [(str(one.config_path), str(one.package), self.file(str(one.config_path))) for one in merged]
-        own = Path(str(resources.files(MODULE)))
+        packaged = Path(str(resources.files(MODULE)))
         return [
-            Source(f"conf/{name}.yaml" if file.is_relative_to(own) else str(file), file, package)
+            Source(f"conf/{name}.yaml" if file.is_relative_to(packaged) else str(file), file, package)
             for name, package, file in files
             if file.is_file()
         ]
 
     def file(self, name: str) -> Path:
-        """Returns the file of an option `GROUP/NAME`, of gsx or of a plugin; it may not exist."""
+        """Return the file of an option `GROUP/NAME`, of gsx or of a plugin; it may not exist."""
         paths = [path for path in self.plugins.config_paths if path.startswith("pkg://")]
         modules = [MODULE, *(path.removeprefix("pkg://") for path in paths)]
         files = [Path(str(resources.files(module))) / f"{name}.yaml" for module in modules]
@@ -125,14 +125,14 @@ class Compositions:
 
 
 def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
-    """Composes and checks an experiment.
+    """Compose and check an experiment.
 
     Raises:
         ConfigError: a group, option, key or value is wrong; the nearest right one is named.
     """
     with hydra_session(plugins):
         settings = settings_from(compose_raw(overrides), plugins)
-    for key in ("output", "folder"):  # which Hydra and the shell take as they are
+    for key in ("output", "folder"):  # Hydra and quoted words do not expand ~
         path = getattr(settings.general, key)
         if path == "~" or path.startswith("~/"):
             raise ConfigError(f"{key} is '{path}', which would be below this folder: give {key}={expand_home(path)}")
@@ -140,7 +140,7 @@ def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
 
 
 def compose_raw(overrides: Sequence[str]) -> DictConfig:
-    """Returns Hydra's composition inside a `hydra_session`, with its errors turned into ours."""
+    """Return Hydra's composition inside a `hydra_session`; raise its errors as ConfigError."""
     from hydra import compose as hydra_compose
     from hydra.errors import HydraException
 
@@ -153,23 +153,24 @@ def compose_raw(overrides: Sequence[str]) -> DictConfig:
 
 
 def check_groups(overrides: Sequence[str]) -> None:
-    """Refuses unknown groups and options with the nearest match before Hydra does so less helpfully."""
+    """Refuse unknown groups and options with the nearest match, which Hydra does not name."""
     groups = known_groups()
     for override in parse_overrides(overrides):
-        if override.key_or_group == "hydra":
-            raise ConfigError("'hydra' is a group of Hydra's own settings: give hydra.NAME=VALUE or hydra/GROUP=NAME")
+        key = override.key_or_group
+        if key == "hydra":
+            raise ConfigError("'hydra' is the group of Hydra's own settings: give hydra.NAME=VALUE or hydra/GROUP=NAME")
         if override.is_sweep_override():
-            refuse_sweep(override, override.key_or_group in groups)
-        if override.key_or_group == "hydra.launcher.n_jobs" and override.value() == 0:
-            raise ConfigError("hydra.launcher.n_jobs is 0; give how many processes, or -1 for as many as cores")
-        if override.key_or_group == "hydra/launcher":
+            refuse_sweep(override, key in groups)
+        if key == "hydra.launcher.n_jobs" and override.value() == 0:
+            raise ConfigError("hydra.launcher.n_jobs is 0; give a number of processes, or -1 for one per core")
+        if key == "hydra/launcher":
             refuse_absent_launcher(str(override.value()))
-        if override.key_or_group in (*groups, "module"):
-            check_choices(override.key_or_group, override.value(), groups)
+        if key in (*groups, "module"):
+            check_choices(key, override.value(), groups)
 
 
 def check_choices(group: str, value: Any, groups: Sequence[str]) -> None:
-    """Refuses options that a group does not have, or one that is chosen twice."""
+    """Refuse options that a group does not have, or one that is chosen twice."""
     options = listed(group)
     if not options:
         inner = ", ".join(one for one in groups if one.startswith(f"{group}/"))
@@ -177,20 +178,19 @@ def check_choices(group: str, value: Any, groups: Sequence[str]) -> None:
     names = [str(name) for name in (value if isinstance(value, list) else [value])]
     for index, name in enumerate(names):
         if name not in options:
-            choices = f"choose from {', '.join(options)}.{nearest(name, options)}"
-            raise ConfigError(f"{group}={name}: there is no such {group}; {choices}")
+            raise ConfigError(f"Unknown {group} '{name}'. Choose from {', '.join(options)}.{nearest(name, options)}")
         if name in names[:index]:
-            raise ConfigError(f"{group}=[{','.join(names)}]: {name} is there twice, and works once: leave one out")
+            raise ConfigError(f"{group}=[{','.join(names)}] names {name} twice: leave one out")
 
 
 def known_groups() -> list[str]:
-    """Returns configuration groups, nested ones included: `regenerator/upscale`."""
+    """Return configuration groups, nested ones included: `regenerator/upscale`."""
     outer = [group for group in listed("", groups=True) if not group.startswith("hydra")]
     return outer + [f"{group}/{inner}" for group in outer for inner in listed(group, groups=True)]
 
 
 def listed(group: str, groups: bool = False) -> list[str]:
-    """Returns options of a group, or the groups in it. Hydra's own list composes its configuration for each answer."""
+    """Return the options of a group, or the groups in it. Hydra's own list composes its configuration for each call."""
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.object_type import ObjectType
 
@@ -200,19 +200,19 @@ def listed(group: str, groups: bool = False) -> list[str]:
 
 
 def explain(error: Exception, overrides: Sequence[str]) -> str:
-    """Returns one sentence for an error of composition, with the nearest key where a key is unknown."""
+    """Return one sentence for an error of composition, with the nearest key for an unknown key."""
     found = re.search(r"Could not override '([^']+)'|Key '([^']+)' is not in struct", str(error))
     if not found:
         return f"the configuration cannot be composed: {first_line(error)}"
     key = (found.group(1) or found.group(2)).lstrip("+~")
     known = known_keys(overrides)
-    if key in known:  # a mapping that is open, such as arguments of a function
+    if key in known:  # an open mapping, such as arguments of a function
         return f"'{key}' takes its entries one by one: '+{key}.NAME=VALUE'"
-    return f"'{key}' is no configuration key.{right_key(key, known) or ' `gsx --cfg job` lists all keys.'}"
+    return unknown_key(key, known)
 
 
 def known_keys(overrides: Sequence[str]) -> list[str]:
-    """Returns the dotted keys of the composition made from the group choices alone."""
+    """Return the dotted keys of the composition made from the group choices alone."""
     from hydra import compose as hydra_compose
 
     choices = [o for o in overrides if re.match(r"^[a-z_/]+=[\w\[\],']+$", o) and o.split("=")[0] in known_groups()]

@@ -1,4 +1,4 @@
-"""Files of configuration packages (`pkg://...`) as Hydra reads them, but each of them parsed once by a process."""
+"""Files of configuration packages (`pkg://...`) as Hydra reads them, but parsed once per process."""
 
 import pickle
 from collections.abc import Sequence
@@ -17,9 +17,9 @@ HYDRAS, OURS = "pkg://", "parsed-once://"
 
 @lru_cache(maxsize=1024)
 def parsed(provider: str, module: str, option: str, modified: int, size: int) -> bytes:
-    """Returns what Hydra reads from a file, pickled: Hydra changes it, and a copy from bytes is made fast.
+    """Return a parsed file pickled: Hydra changes it, and unpickling copies fast.
 
-    modified: ns; with size it tells a file that has been edited since.
+    modified: time in ns; with the size it distinguishes edited files.
     """
     return pickle.dumps(ImportlibResourcesConfigSource(provider, HYDRAS + module).load_config(option))
 
@@ -29,11 +29,9 @@ class ParsedOnce(ImportlibResourcesConfigSource):
 
     @staticmethod
     def scheme() -> str:
-        """Returns what its search paths begin with."""
         return OURS.removesuffix("://")
 
     def load_config(self, config_path: str) -> ConfigResult:
-        """Returns an option; errors as Hydra's."""
         file = resources.files(self.path) / self._normalize_file_name(config_path)
         if not (isinstance(file, Path) and file.is_file()):  # in an archive, or absent
             return super().load_config(config_path)
@@ -42,13 +40,12 @@ class ParsedOnce(ImportlibResourcesConfigSource):
 
 
 class GsxSearchPath(SearchPathPlugin):
-    """The search path of a session: packages parsed once, and those of gsx's plugins behind the others."""
+    """Search path of a session: packages parsed once; those of gsx's plugins come last."""
 
     extra: tuple[str, ...] = ()
-    """Of gsx's plugins."""
+    """Search paths of gsx's plugins."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Changes the search path; Hydra's hook."""
         for path in self.extra:
             search_path.append(provider="gsx", path=path)
         for element in search_path.get_path():
@@ -56,7 +53,7 @@ class GsxSearchPath(SearchPathPlugin):
 
 
 def register(extra: Sequence[str]) -> None:
-    """Lets Hydra search these paths, too, from now on."""
+    """Add search paths to all later sessions of Hydra."""
     GsxSearchPath.extra = tuple(extra)
     for plugin in (ParsedOnce, GsxSearchPath):
         Plugins.instance().register(plugin)

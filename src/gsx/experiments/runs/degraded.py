@@ -1,4 +1,4 @@
-"""Photographs made worse in a known way, so that what estimates and corrects this can be measured (research alone)."""
+"""Photos degraded in a known way, to measure modules that estimate and correct this (for research only)."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -46,18 +46,18 @@ class Patch:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DegradedSource(DerivedSource):
-    """A photograph in other light, by a moving camera, with something in the way."""
+    """A photo in other light, by a moving camera, with something in the way."""
 
     gains: Float[Tensor, "3"] | None = None
     """Factors of display values, which saturate."""
     slopes: tuple[float, float] | None = None
-    """Of log gains of display values, to the right and down, from the middle of the frame to its sides."""
+    """Slopes of log gains of display values, to the right and down, from the middle of the frame to its sides."""
     patch: Patch | None = None
     movement: tuple[float, float] | None = None
-    """Across and down during the exposure, as shares of the frame's sides."""
+    """Movement across and down during the exposure, as shares of the frame's sides."""
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
-        """Return the degraded photograph."""
+        """Return the degraded photo."""
         image = super().image(camera) if self.movement is None else blur(self.source, camera, *self.movement)
         if self.gains is not None or self.slopes is not None:
             light = self.light(camera).to(image.device)
@@ -74,39 +74,39 @@ class DegradedSource(DerivedSource):
 
 
 def blur(source: ImageSource, camera: Camera, across: float, down: float) -> UInt8[Tensor, "3 H W"]:
-    """Return the picture of a camera that moves by these shares of the frame's sides; a crop is cut from the frame."""
+    """Return the photo of a camera that moves by these shares of the frame's sides; a crop is cut from the frame."""
     frame = camera.frame
     whole = source.image(camera.crop(-frame.left, -frame.top, frame.width, frame.height)).float()
-    taken = motion_blurred(whole, across * frame.width, down * frame.height).round().clamp(0, 255).to(torch.uint8)
-    return taken[:, frame.top : frame.top + camera.height, frame.left : frame.left + camera.width]
+    blurred = motion_blurred(whole, across * frame.width, down * frame.height).round().clamp(0, 255).to(torch.uint8)
+    return blurred[:, frame.top : frame.top + camera.height, frame.left : frame.left + camera.width]
 
 
-# -- one photograph ----------------------------------------------------------------------------------------------------
+# -- one photo ---------------------------------------------------------------------------------------------------------
 
 
 def generator_of(kind: str, name: str) -> torch.Generator:
-    """Return the generator of one photograph's numbers: the same in every run, whatever the seed."""
+    """Return the generator of one photo's numbers, which do not depend on the run's seed."""
     return torch.Generator().manual_seed(derived_seed(f"disturbed {kind}", name))
 
 
 def gains_of(name: str, spread: float) -> Float[Tensor, "3"]:
-    """Draw the gains of a photograph by its name."""
+    """Draw the gains of a photo by its name."""
     drawn = torch.randn(4, generator=generator_of("exposure", name))
     return (spread * (drawn[0] + BALANCE * drawn[1:])).exp()
 
 
 def pair_of(kind: str, name: str, spread: float) -> tuple[float, float]:
-    """Draw two numbers of this standard deviation by a photograph's name: to the right, and down.
+    """Draw two numbers of this standard deviation by a photo's name: to the right, and down.
 
-    kind: `shade`: slopes of log gains from the middle to the sides. `pose`: px by which the middle of the picture
-    moves. `blur`: px by which the picture moves during the exposure.
+    kind: `shade`: slopes of log gains from the middle to the sides. `pose`: shift of the picture's middle, px. `blur`:
+    movement of the picture during the exposure, px.
     """
     right, down = (spread * torch.randn(2, generator=generator_of(kind, name)).double()).tolist()
     return right, down
 
 
 def slopes_among(names: Sequence[str], spread: float) -> dict[str, tuple[float, float]]:
-    """Draw slopes of photographs less their mean, if they are several: light that all share looks like the scene's."""
+    """Draw slopes of photos less their mean, if there are several: light that all share looks like the scene's."""
     drawn = {name: pair_of("shade", name, spread) for name in names}
     if len(names) < 2:
         return drawn
@@ -115,7 +115,7 @@ def slopes_among(names: Sequence[str], spread: float) -> dict[str, tuple[float, 
 
 
 def turn(camera: Camera, name: str, spread: float) -> Camera:
-    """Turn a camera about its centre, so that its picture moves by the photograph's `pose` numbers."""
+    """Turn a camera about its centre, so that its picture moves by the photo's `pose` numbers."""
     across, down = pair_of("pose", name, spread)
     by = about(0, -down / camera.fy) @ about(1, across / camera.fx)
     rotation, translation = (by @ part.double() for part in (camera.rotation, camera.translation))
@@ -133,7 +133,7 @@ def about(axis: int, angle: float) -> Float[Tensor, "3 3"]:
 
 
 def patch_of(name: str, share: float) -> Patch:
-    """Draw a patch that covers this share of a photograph, anywhere on it, in any colour."""
+    """Draw a patch that covers this share of a photo, anywhere on it, in any colour."""
     generator, side = generator_of("covered", name), math.sqrt(share)
     left, top = ((1 - side) * torch.rand(2, generator=generator)).tolist()
     colour = torch.randint(0, 256, (3,), generator=generator, dtype=torch.uint8)
@@ -141,7 +141,7 @@ def patch_of(name: str, share: float) -> Patch:
 
 
 def degrade_view(view: View, by: Mapping[str, float], slopes: tuple[float, float] | None) -> View:
-    """Degrade one photograph; a wrong pose is the view's, the photograph stays. slopes: of its light."""
+    """Degrade one photo, with `slopes` of its light; a wrong pose changes the view's camera, not the photo."""
     exposure, pose, covered, moved = (by.get(kind, 0.0) for kind in ("exposure", "pose", "covered", "blur"))
     source = DegradedSource(
         source=as_taken(view),
@@ -157,26 +157,25 @@ def degrade_view(view: View, by: Mapping[str, float], slopes: tuple[float, float
 
 
 def choose(names: Sequence[str], share: float) -> set[str]:
-    """Choose this share of the photographs, at least one: the same in every run."""
+    """Choose this share of the photos, at least one; the choice does not depend on the run's seed."""
     order = sorted(names, key=lambda name: derived_seed("disturbed some", name))
     return set(order[: max(1, round(share * len(order)))])
 
 
 def degrade(scene: Scene, by: Mapping[str, float]) -> Scene:
-    """Degrade training photographs and note it; test photographs stay as they are.
+    """Degrade training photos and note it; test photos stay as they are.
 
-    by: `exposure`: standard deviation of log gains of display values, one a photograph; channels differ by a quarter.
-    `shade`: of how much log gains grow from the middle of a photograph to its sides, to the right and down, less the
-    mean over the photographs. `pose`: of how far pictures move along each axis when cameras are turned, px. `blur`: of
-    how far they move during the exposure, px. `covered`: share of each photograph behind a patch. `some`: share of
-    photographs that are degraded; 1 by default.
+    by: `exposure`: standard deviation of log gains of display values per photo; channels differ by a quarter. `shade`:
+    that of the growth of log gains from the middle of a photo to its sides, less the mean over the photos. `pose`,
+    `blur`: that of the shift of pictures by turned cameras, and of their movement during the exposure, px. `covered`:
+    share of each photo behind a patch. `some`: share of photos to degrade (1).
 
     Raises:
-        ConfigError: there is no such disturbance, or it is too large.
+        ConfigError: a disturbance is unknown or too large.
     """
     for kind, value in by.items():
         if kind not in MOST:
-            raise ConfigError(f"scene.disturb.{kind}: photographs can be disturbed by {', '.join(MOST)}")
+            raise ConfigError(f"Unknown disturbance scene.disturb.{kind}. Choose from {', '.join(MOST)}.")
         if value > MOST[kind]:
             raise ConfigError(f"scene.disturb.{kind} is {value:g}; give at most {MOST[kind]:g}")
     kinds = {kind: value for kind, value in by.items() if value and kind != "some"}
@@ -184,8 +183,8 @@ def degrade(scene: Scene, by: Mapping[str, float]) -> Scene:
     if not kinds or not some:
         return scene
     names = choose([view.name for view in scene.train], some)
-    suffering = [view.name for view in scene.train if view.name in names]
-    slopes = slopes_among(suffering, kinds["shade"]) if "shade" in kinds else {}
+    chosen = [view.name for view in scene.train if view.name in names]
+    slopes = slopes_among(chosen, kinds["shade"]) if "shade" in kinds else {}
     train = [degrade_view(view, kinds, slopes.get(view.name)) if view.name in names else view for view in scene.train]
     listed = ", ".join(f"{kind} {value:g}" for kind, value in kinds.items())
     note = f"disturbed: {len(names)} of {len(scene.train)} training photographs (scene.disturb: {listed})"

@@ -1,4 +1,4 @@
-"""What a run is trained on and with: environment.json, and the first lines of the log."""
+"""Scene, machine and versions of a run: environment.json, and the first lines of the log."""
 
 import hashlib
 import logging
@@ -26,11 +26,11 @@ logger = logging.getLogger(__name__)
 
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "pycolmap", "OpenImageIO", "kornia", "pluggy", "safetensors")
 POSE_DIGITS = 6
-"""Digits of camera values that count, of the largest of its kind: what other machines compute differs behind them."""
+"""Digits of camera values in digests, relative to the largest of their kind: other machines differ beyond them."""
 
 
 def environment(run: Run, plugins: Plugins, idle: Collection[str]) -> dict[str, Any]:
-    """Returns machine, versions and the rescaled schedule for environment.json; `idle`: keys that change no result."""
+    """Return the content of environment.json; `idle`: keys that change no result."""
     scene = run.scene
     return {
         "gsx": __version__,
@@ -62,7 +62,7 @@ def environment(run: Run, plugins: Plugins, idle: Collection[str]) -> dict[str, 
 
 
 def camera_digest(views: Sequence[View]) -> str:
-    """Returns a digest of names, sizes, intrinsics and poses of views, in order."""
+    """Return a digest of names, sizes, intrinsics and poses of views, in order."""
     content = hashlib.sha256(repr([(view.name, view.camera.size) for view in views]).encode())
     cameras = [view.camera for view in views]
     numbers = [torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float64)]
@@ -75,7 +75,7 @@ def camera_digest(views: Sequence[View]) -> str:
 
 
 def installed_version(package: str) -> str:
-    """Returns the version of an installed distribution."""
+    """Return the version of an installed distribution."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -83,7 +83,7 @@ def installed_version(package: str) -> str:
 
 
 def announce(run: Run, plugins: Plugins) -> None:
-    """Logs what is about to be trained, and by which schedule."""
+    """Log scene, notes, failed plugins, the schedules and the run folder."""
     scene = run.scene
     (width, height), points = scene.train[0].camera.size, f"{len(scene.points):,}"
     views = f"{len(scene.train)} training and {len(scene.test)} test views of {width}x{height} px"
@@ -103,7 +103,7 @@ def announce(run: Run, plugins: Plugins) -> None:
 
 
 def in_words(value: object) -> str:
-    """Returns a number of the plan, or several, or whatever else a plugin plans, in words."""
+    """Format a value of a plan: a number, several, or anything else of a plugin."""
     if isinstance(value, list | tuple):
         return " ".join(map(in_words, value)) or "none"
     return f"{value:.6g}" if isinstance(value, int | float) else str(value)

@@ -1,4 +1,4 @@
-"""evaluation.json and the pictures of a run, and what they say in words."""
+"""evaluation.json and the pictures of a run, and its summary in the log."""
 
 import logging
 import time
@@ -22,14 +22,14 @@ logger = logging.getLogger(__name__)
 
 
 def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
-    """Writes evaluation.json and the pictures of a run."""
+    """Write evaluation.json and the pictures of a run; return the evaluation."""
     options, started = settings.evaluation, time.perf_counter()
     evaluator, pictures = Evaluator(run, options), Pictures(run.folder / "renders", run.step)
     if run.scene.test:
         logger.info("evaluating %d test views at zoom %s", len(run.scene.test), options.zoom)
     evaluation = evaluator.evaluate(pictures, Countdown("evaluating", evaluator.work()).advance)
     if run.scene.test:
-        embellish(run, pictures, options)
+        add_depth_and_flight(run, pictures, options)
     pictures.write_index()
     write_pseudo_pictures(run, options)
     evaluation |= {
@@ -46,12 +46,8 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     return evaluation
 
 
-def embellish(run: Run, pictures: Pictures, options: EvalOptions) -> None:
-    """Draws depth and a flight for the report; figures are kept if that fails.
-
-    Raises:
-        InputError: they cannot be written, which is so of all that a run has to leave.
-    """
+def add_depth_and_flight(run: Run, pictures: Pictures, options: EvalOptions) -> None:
+    """Draw depth and a flight for the report; figures are kept if drawing fails, not if writing does (InputError)."""
     try:
         add_depth(run, pictures, options.tile_pixels)
         if options.flight:
@@ -61,17 +57,17 @@ def embellish(run: Run, pictures: Pictures, options: EvalOptions) -> None:
 
 
 def warn_of_paths(before: dict[str, Any], now: dict[str, Any]) -> None:
-    """Warns if another path of the rasterizer has drawn what was timed in an earlier evaluation."""
+    """Warn if an earlier evaluation was timed with another path of the rasterizer."""
     path = before.get("render_path")
     if path and path != now["render_path"] and before.get("render_fps"):
         logger.warning(
-            "renders/s are now by the %s path; the evaluation before had %.1f by the %s path, which are not comparable",
-            now["render_path"], before["render_fps"], path,
-        )  # fmt: skip
+            "renders/s are measured with the %s path; the %.1f of the evaluation before (%s path) are not comparable",
+            *(now["render_path"], before["render_fps"], path),
+        )
 
 
 def summary(evaluation: dict[str, Any]) -> list[str]:
-    """Returns the result in a few lines."""
+    """Return the result in a few lines."""
     e = evaluation
     memory = "n/a" if e["peak_memory_mb"] is None else f"{e['peak_memory_mb']:,.0f} MB"
     speed = "" if e["render_fps"] is None else f"{e['render_fps']:.1f} renders/s ({e['render_path']}), "
@@ -82,28 +78,23 @@ def summary(evaluation: dict[str, Any]) -> list[str]:
     )
     if measures_nothing(e):
         return [cost, *remarks_of(e)]
-    return [quality(e), cost, *(zoom_line(factor, result) for factor, result in e["zoom"].items()), *remarks_of(e)]
-
-
-def quality(evaluation: dict[str, Any]) -> str:
-    """Returns the mean figures of test views in words."""
-    e = evaluation
     lpips = "n/a (no weights)" if e["lpips"] is None else f"{e['lpips']:.4f}"
-    return f"held-out PSNR {e['psnr']:.2f} dB, SSIM ({e['protocol']['ssim']}) {e['ssim']:.4f}, LPIPS {lpips}"
+    quality = f"held-out PSNR {e['psnr']:.2f} dB, SSIM ({e['protocol']['ssim']}) {e['ssim']:.4f}, LPIPS {lpips}"
+    return [quality, cost, *(zoom_line(factor, result) for factor, result in e["zoom"].items()), *remarks_of(e)]
 
 
 def remedies(run: Run, evaluation: dict[str, Any], remedy: str) -> list[str]:
-    """Returns what to try where a zoomed render loses to the enlarged one, and no filter compensates for dilation."""
+    """Return what to try if a plain model's zoomed render loses to the enlarged one."""
     lost = [
         factor for factor, e in evaluation["zoom"].items() if float(factor) > 1 and e.get("beats_enlarged") is False
     ]
     if not lost or not remedy or run.raster.compensate or run.raster.zoomed != "plain":
         return []
-    return [f"a model that is filtered for zooming in: the same command with {remedy}"]
+    return [f"for a model that is filtered for zooming in, repeat the command with {remedy}"]
 
 
 def zoom_line(factor: str, result: dict[str, Any]) -> str:
-    """Returns one zoom figure with its verdict."""
+    """Return the result at one zoom in words."""
     if "unavailable" in result:
         return f"zoom x{factor}: n/a, {result['unavailable']}"
     if factor == "1":
@@ -115,4 +106,4 @@ def zoom_line(factor: str, result: dict[str, Any]) -> str:
     shares = [share for kind in DETAIL_OF if (share := detail_share(result, kind)) is not None]
     if len(shares) < len(DETAIL_OF):
         return text
-    return text + "; detail {:+.3f} (x1 {}: {:+.3f}, photograph: {:+.3f})".format(shares[0], resized, *shares[1:])
+    return text + "; detail {:+.3f} (x1 {}: {:+.3f}, photo: {:+.3f})".format(shares[0], resized, *shares[1:])

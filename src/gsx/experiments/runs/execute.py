@@ -17,14 +17,13 @@ from gsx.engine.compile_cache import training_clock
 from gsx.experiments.evaluation.remarks import CapNotice
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder import checkpoint
-from gsx.experiments.run_folder.claims import claimed
 from gsx.experiments.run_folder.files import SPLATS
 from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.environment import announce
 from gsx.experiments.runs.evaluate import evaluate
 from gsx.experiments.runs.export import export
 from gsx.experiments.runs.guard import Agreement, Guard
-from gsx.experiments.runs.open import as_trained, open_run, refuse_other, refuse_training
+from gsx.experiments.runs.open import reopened
 from gsx.experiments.runs.progress import MetricsLog, Progress
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.settings import Settings
@@ -38,29 +37,31 @@ class Checkpointer:
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
-        """Saves when due."""
+        """Save when due."""
         if run.step % run.training.checkpoint_every == 0 and not run.complete:
             checkpoint.save(run)
 
     @hookimpl
     def gsx_training_finished(self, run: Run) -> None:
-        """Saves the last state."""
+        """Save the last state."""
         checkpoint.save(run)
 
 
 def status(run: Run, state: str, reason: str = "") -> None:
-    """Records the state of a run for reports over many."""
+    """Write the state of a run to status.json."""
     write_json(run.folder / "status.json", {"state": state, "reason": reason, "step": run.step})
 
 
 def execute(run: Run, settings: Settings, plugins: Plugins, keep_states: bool = False) -> None:
-    """Trains from the current step on; when complete, evaluates and reports. Interrupted runs keep a checkpoint.
+    """Train from the current step on; when complete, evaluate and report. Interrupted runs keep a checkpoint.
 
-    All ranks but the first only train. keep_states: for other runs to branch from, with `init=warm_start`; not of a run
+    Ranks above 0 only train. keep_states: keep states for other runs to branch from (`init=warm_start`); not for a run
     whose first steps may have followed other settings.
     """
     if not run.ranks.first:
-        follow(run, plugins)
+        warm(run, helped=False)
+        with plugins.listening([Guard(), Agreement()]):
+            train(run, plugins, training_clock)
         return
     trackers = build_trackers(settings.trackers)
     remove_partial(cache_root())
@@ -94,10 +95,10 @@ def execute(run: Run, settings: Settings, plugins: Plugins, keep_states: bool = 
 
 
 def warm_or_eager(run: Run, settings: Settings) -> None:
-    """Compiles what steps need; where that fails at the beginning of a run with path=auto, it goes eagerly.
+    """Compile what steps need; if that fails at the start of a run with path=auto, use the eager path.
 
     Raises:
-        CompilerError: elsewhere.
+        CompilerError: compiling failed elsewhere.
     """
     try:
         warm(run)
@@ -105,7 +106,7 @@ def warm_or_eager(run: Run, settings: Settings) -> None:
         chosen_by_gsx = settings.raster.path == "auto" and run.raster.path == "compiled"
         if not chosen_by_gsx or run.step > 0 or run.ranks.size > 1:
             raise
-        logger.warning("%s; going on with the eager path, which is several times slower", error)
+        logger.warning("%s; using the eager path, which is several times slower", error)
         run.raster = run.backbone.raster = replace(run.raster, path="eager")
         facts = read_json(run.folder / "environment.json")
         write_json(run.folder / "environment.json", facts | {"rasterizer": "eager"})
@@ -113,10 +114,10 @@ def warm_or_eager(run: Run, settings: Settings) -> None:
 
 @contextmanager
 def viewed(run: Run, settings: Settings) -> Iterator[list[object]]:
-    """Yields the listener that shows the model in a browser, with `viewer=true`, and logs its address.
+    """Yield the listener of `viewer=true` that shows the model in a browser, and log its address.
 
     Raises:
-        ConfigError, InputError: viser is not installed, or nothing can listen there.
+        ConfigError, InputError: viser is not installed, or the port is not free.
     """
     general = settings.general
     if not general.viewer:
@@ -133,9 +134,9 @@ def viewed(run: Run, settings: Settings) -> Iterator[list[object]]:
 
 
 def save_on_failure(run: Run, error: BaseException) -> None:
-    """Writes a checkpoint of the last step after an error, where the model is that of a step, and the reason."""
+    """Write the reason of a failure, and a checkpoint of the last step if the model is still that of a step."""
     kept = run.step in map(checkpoint.step_of, checkpoint.sidecars(run.folder / "checkpoints"))
-    nothing = run.step == 0 and not isinstance(error, KeyboardInterrupt | CompilerError)  # who says how to go on
+    nothing = run.step == 0 and not isinstance(error, KeyboardInterrupt | CompilerError)  # their remedy is to resume
     with problems_logged(f"the checkpoint of step {run.step}"):
         if not (kept or nothing or run.progress.changing or isinstance(error, LostModel)):
             checkpoint.save(run)
@@ -145,22 +146,15 @@ def save_on_failure(run: Run, error: BaseException) -> None:
 
 @contextmanager
 def problems_logged(what: str) -> Iterator[None]:
-    """Logs what cannot be written after an error, for want of space or memory, and does not hide that error."""
+    """Log what cannot be written after an error (no space, no memory), so that it does not hide that error."""
     try:
         yield
     except Exception as problem:
-        logger.warning("after this error %s could not be kept (%s)", what, first_line(problem))
-
-
-def follow(run: Run, plugins: Plugins) -> None:
-    """Trains as the first process does, and writes nothing."""
-    warm(run, helped=False)
-    with plugins.listening([Guard(), Agreement()]):
-        train(run, plugins, training_clock)
+        logger.warning("after this error %s could not be saved (%s)", what, first_line(problem))
 
 
 def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:
-    """Evaluates, exports, draws and reports a trained run."""
+    """Evaluate, export and report a trained run."""
     evaluation = evaluate(run, settings)
     plugins.emit.gsx_evaluated(run=run, evaluation=evaluation)
     export(run, run.folder / SPLATS)
@@ -171,19 +165,8 @@ def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:
 
 
 def evaluate_again(folder: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """Writes evaluation.json, pictures, splat file and report of a run, drawn by the path that trained it.
-
-    Raises:
-        ConfigError, InputError: an override is wrong, the folder is no run, or somebody trains in it.
-        CheckpointError: there is no usable checkpoint.
-    """
-    refuse_other(folder)
-    refuse_training(folder, overrides)
-    with claimed(folder):
-        remove_partial(folder)
-        run, settings = open_run(folder, plugins, overrides)
-        run.raster = as_trained(run)
-        warm(run)
+    """Write evaluation.json, pictures, splat file and report of a run anew; errors as `reopened`."""
+    with reopened(folder, plugins, overrides) as (run, settings):
         if run.complete:
             return finish(run, settings, plugins)
         evaluation = evaluate(run, settings)

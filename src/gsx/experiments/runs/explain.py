@@ -1,4 +1,4 @@
-"""What a key of the configuration is: its value, what it may be, which files set it, and what they say of it."""
+"""Explains a configuration key: its value, its type and range, the files that set it, and their comments."""
 
 import re
 import types
@@ -15,15 +15,11 @@ from gsx.core.ranges import Range, parts_of
 from gsx.experiments.run_folder.general_options import GeneralOptions
 from gsx.experiments.runs.compose import Compositions, Source, known_groups, listed
 from gsx.experiments.runs.settings import Settings
-from gsx.experiments.runs.typed import dotted, right_key
+from gsx.experiments.runs.typed import dotted, unknown_key
 
 KINDS = {int: "whole number", float: "number", str: "text", bool: "true or false", Path: "path"}
 WIDTH = 110
-"""Characters of a comment where it shares a line with a key or an option."""
-SEVERAL = {"augmenter": "augmenter", "tracker": "tracker", "module": "training"}
-"""Where options lie of groups of which several are chosen."""
-LISTED = ("scene", "backbone", *SEVERAL, "regenerator/upscale", "regenerator/restore", "rasterizer")
-"""Groups whose options have keys of their own; presets and variants set those of others."""
+"""Characters of a comment that shares a line with a key or an option."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +29,7 @@ class Parsed:
     source: Source
     text: str
     node: yaml.Node | None
-    """None: it holds nothing."""
+    """None: the file is empty."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +39,12 @@ class Entry:
     place: str
     """File and line."""
     value: str
-    """As it is written there; empty where keys are below it."""
+    """Text of its value; empty for a key with keys below it."""
     comment: str
 
 
 def explain(key: str, overrides: Sequence[str], plugins: Plugins) -> list[str]:
-    """Returns lines on a key, a group or an option of one (`backbone=scaffold`), in a composition.
+    """Return lines on a key, a group or an option of one (`backbone=scaffold`), in a composition.
 
     Raises:
         ConfigError: there is no such key; the nearest is named.
@@ -60,9 +56,9 @@ def explain(key: str, overrides: Sequence[str], plugins: Plugins) -> list[str]:
         values, groups = compositions.values(overrides), known_groups()
         known = dict.fromkeys([*dotted(values), *groups])
         if key not in known:
-            raise ConfigError(f"'{key}' is no configuration key.{right_key(key, known)} `gsx --cfg job` lists all keys")
+            raise ConfigError(unknown_key(key, known))
         settings, files = compositions.settings(overrides), parsed(compositions.sources(overrides))
-        dotted_key = key.replace("/", ".")  # where what a nested group holds is
+        dotted_key = key.replace("/", ".")  # the content of a nested group
         value = value_at(key, values)
         typed = [word.partition("=")[2] for word in overrides if word.startswith(f"{key}=")]
         details = [kind_of(key, settings), *(f"command line  {word}" for word in typed)]
@@ -75,14 +71,14 @@ def explain(key: str, overrides: Sequence[str], plugins: Plugins) -> list[str]:
 
 
 def options_of(group: str, compositions: Compositions, files: Sequence[Parsed]) -> list[str]:
-    """Returns a line for each option of a group; those of the composition are marked."""
+    """Return a line for each option of a group; those of the composition are marked."""
     chosen = {file.source.file for file in files}
     places = {name: compositions.file(f"{group}/{name}") for name in listed(group)}
     return [f"{'*' if file in chosen else ' '} {name:24} {head_of(file)}".rstrip() for name, file in places.items()]
 
 
 def value_at(key: str, node: Any) -> Any:
-    """Returns the value of a dotted key; MISSING: there is none."""
+    """Return the value of a dotted key; MISSING: there is none."""
     for part in key.split("."):
         if not isinstance(node, dict) or part not in node:
             return MISSING
@@ -91,19 +87,19 @@ def value_at(key: str, node: Any) -> Any:
 
 
 def written(value: Any) -> str:
-    """Returns a value as the command line has it."""
+    """Return a value in the syntax of the command line."""
     text = yaml.safe_dump(value, default_flow_style=True, width=1 << 20, allow_unicode=True)
     return text.removesuffix("\n...\n").strip()
 
 
 def lines_of(entry: Entry) -> list[str]:
-    """Returns an entry in lines."""
+    """Return an entry in lines."""
     first = f"{entry.place}  {entry.value}".rstrip()
     return [first, f"    {entry.comment}"] if entry.comment else [first]
 
 
 def below(key: str, node: dict[str, Any], files: Sequence[Parsed]) -> list[str]:
-    """Returns a line for each key below a key: value, and the comment of the file that sets it."""
+    """Return a line for each key below a key: value, and the comment of the file that sets it."""
     inner = value_at(key, node)
     lines = []
     for name in dotted(inner):
@@ -118,19 +114,19 @@ def below(key: str, node: dict[str, Any], files: Sequence[Parsed]) -> list[str]:
 
 
 def parsed(sources: Sequence[Source]) -> list[Parsed]:
-    """Returns the files of a composition, parsed."""
+    """Parse the files of a composition."""
     texts = [source.file.read_text(encoding="utf-8") for source in sources]
     nodes = [yaml.compose(text, Loader=yaml.SafeLoader) for text in texts]
     return [Parsed(source, text, node) for source, text, node in zip(sources, texts, nodes, strict=True)]
 
 
 def comment_on(key: str, files: Sequence[Parsed]) -> str:
-    """Returns the comment of the last file that has one on a key, or an empty text."""
+    """Return the comment on a key in the last file that has one, or an empty text."""
     return next((entry.comment for entry in reversed(entries(files, key)) if entry.comment), "")
 
 
 def entries(files: Sequence[Parsed], key: str) -> list[Entry]:
-    """Returns where a key is set, in the order in which files take the place of one another."""
+    """Return the entries that set a key, in the order of merging."""
     found, parts = [], key.split(".")
     for file in files:
         package = file.source.package.split(".") if file.source.package else []
@@ -140,7 +136,7 @@ def entries(files: Sequence[Parsed], key: str) -> list[Entry]:
 
 
 def entry_in(file: Parsed, parts: Sequence[str]) -> Entry | None:
-    """Returns a key in one file; None: it is not set there."""
+    """Return a key in one file; None: it is not set there."""
     name, node = None, file.node
     for part in parts:
         pairs = node.value if isinstance(node, yaml.MappingNode) else []
@@ -157,7 +153,7 @@ def entry_in(file: Parsed, parts: Sequence[str]) -> Entry | None:
 
 
 def above(lines: Sequence[str], line: int, column: int) -> list[str]:
-    """Returns the comments above a key, but for those at the head of a file, which are about all of it."""
+    """Return the comments above a key, but not the comment on a whole file at its head."""
     first = line
     while first > 0 and lines[first - 1].startswith(" " * column + "#"):
         first -= 1
@@ -165,7 +161,7 @@ def above(lines: Sequence[str], line: int, column: int) -> list[str]:
 
 
 def head_of(file: Path) -> str:
-    """Returns the first sentence of the comment that a file begins with."""
+    """Return the first sentence of the comment at the head of a file."""
     words = []
     for line in file.read_text(encoding="utf-8").splitlines() if file.is_file() else []:
         if not line.startswith("#"):
@@ -178,7 +174,7 @@ def head_of(file: Path) -> str:
 
 
 def kind_of(key: str, settings: Settings) -> str:
-    """Returns what a value may be, in words; empty where the options of its component do not say."""
+    """Return type and range of a key in words; empty if no dataclass of options has it."""
     for prefix, schema in sorted(schemas(settings).items(), reverse=True):  # those below others first
         if key.startswith(prefix):
             return kind_in(schema, key.removeprefix(prefix).split("."))
@@ -186,20 +182,19 @@ def kind_of(key: str, settings: Settings) -> str:
 
 
 def schemas(settings: Settings) -> dict[str, type]:
-    """Returns dataclasses of options by the beginning of their keys; general options have none."""
+    """Return dataclasses of options by the prefix of their keys; that of general options is empty."""
     single = {"training": settings.training, "eval": settings.evaluation, "rasterizer": settings.raster}
+    several = {"training": settings.modules, "augmenter": settings.augmenters, "tracker": settings.trackers}
+    several |= {"regenerator": settings.regenerators}
     chosen = {"scene": settings.scene, "backbone": settings.backbone}
-    chosen |= {f"training.{name}": one for name, one in settings.modules.items()}
-    chosen |= {f"augmenter.{name}": one for name, one in settings.augmenters.items()}
-    chosen |= {f"regenerator.{role}": one for role, one in settings.regenerators.items()}
-    chosen |= {f"tracker.{name}": one for name, one in settings.trackers.items()}
+    chosen |= {f"{group}.{name}": one for group, nodes in several.items() for name, one in nodes.items()}
     found = {f"{key}.": type(options) for key, options in single.items()}
     found |= {f"{key}.": one.component.options for key, one in chosen.items()}
     return found | {"": GeneralOptions}
 
 
 def kind_in(schema: type, parts: Sequence[str]) -> str:
-    """Returns what a field of a dataclass may hold, in words."""
+    """Return type and range of a field of a dataclass in words."""
     hints = get_type_hints(schema, include_extras=True)
     if parts[0] not in hints:
         return ""
@@ -212,7 +207,7 @@ def kind_in(schema: type, parts: Sequence[str]) -> str:
 
 
 def in_words(hint: Any) -> str:
-    """Returns a type in words; empty: one that has none."""
+    """Return a type in words; empty for others than plain types, their unions and lists."""
     origin, inner = get_origin(hint), list(get_args(hint))
     if origin in (Union, types.UnionType):
         words = [in_words(part) for part in inner if part is not type(None)]
@@ -222,51 +217,3 @@ def in_words(hint: Any) -> str:
     if hasattr(hint, "__metadata__"):
         return in_words(inner[0])
     return KINDS.get(hint, "")
-
-
-# -- all of it -----------------------------------------------------------------------------------------------------
-
-
-def reference(plugins: Plugins) -> list[str]:
-    """Returns a page over all keys, in Markdown: of a run, then of each option of each group."""
-    lines = [
-        "# Configuration",
-        "",
-        "Every key, its value, what it may be, and what is written beside it where it is set. On the command line:",
-        "`gsx KEY=VALUE`, `gsx GROUP=OPTION`, `gsx explain KEY`.",
-    ]
-    with Compositions(plugins) as compositions:
-        groups = [group for group in known_groups() if listed(group)]
-        lines += ["", "## Of a run", "", *keys_table("", [], compositions, groups)]
-        for group in filter(LISTED.__contains__, groups):
-            for option in listed(group):
-                word = f"{group}=[{option}]" if group in SEVERAL else f"{group}={option}"
-                lines += ["", f"## {word}", "", head_of(compositions.file(f"{group}/{option}")) + ".", ""]
-                prefix = f"{SEVERAL[group]}.{option}" if group in SEVERAL else group.replace("/", ".")
-                lines += keys_table(prefix, [word], compositions, groups)
-    return [*lines, ""]
-
-
-def keys_table(prefix: str, words: Sequence[str], compositions: Compositions, groups: Sequence[str]) -> list[str]:
-    """Returns a row for each key below a prefix; without one, for those of a run that no group brings."""
-    values = compositions.values(words)
-    try:
-        settings = compositions.settings(words)
-    except ConfigError:  # an option that needs more, a model for example
-        settings = None
-    files = parsed(compositions.sources(words))
-    of_groups = tuple(f"{group.partition('/')[0]}." for group in groups)
-    rows = ["| key | value | may be | |", "|---|---|---|---|"]
-    for key in dotted(values):
-        node = value_at(key, values)
-        belongs = key.startswith(f"{prefix}.") if prefix else not key.startswith(of_groups)
-        if belongs and not isinstance(node, dict):
-            kind = kind_of(key, settings) if settings else ""
-            cells = (f"`{key}`", f"`{written(node)}`", kind, comment_on(key, files))
-            rows.append("| " + " | ".join(map(in_cell, cells)) + " |")
-    return rows
-
-
-def in_cell(text: str) -> str:
-    """Returns a text for a cell of a table, with its marks escaped."""
-    return re.sub(r"([|*])", r"\\\1", text) if "`" in text else re.sub(r"([|*_<>])", r"\\\1", text)

@@ -36,11 +36,11 @@ from gsx.formats.spz import FURTHEST
 from gsx.formats.suffixes import STANDARD, refuse_suffix, suffix_of
 
 PAGE = ".html"
-"""A page with a viewer and the model in it."""
+"""Suffix of a page with a viewer and the model in it."""
 PAGE_VIEWS = 6
-"""Test views that a page has as places to go to; it starts at the first."""
-LOOKED_AT = 5
-"""Views by which losses are measured."""
+"""Test views that a page offers; it starts at the first."""
+LOSS_VIEWS = 5
+"""Views that losses are measured on."""
 SPZ_FORM = SpzForm()
 
 logger = logging.getLogger(__name__)
@@ -48,21 +48,20 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Exported:
-    """What was written in a standard form."""
+    """Content of a standard splat file."""
 
     gaussians: Gaussians
     baked: bool
-    """They stand for a model that has others for every camera."""
+    """True: the model has other Gaussians for every camera."""
 
 
 def export(
     run: Run, path: Path, camera: Camera | None = None, spz: SpzForm = SPZ_FORM, zoom: float = 0, local: bool = False
 ) -> Exported | None:
-    """Writes the backbone's own splat file, or a standard one, or a page; returns what a standard one holds.
+    """Write the backbone's own splat file, a standard one, or a page; return the content of a standard one.
 
-    camera: what is drawn for it alone. Without one a model that has no standard form is baked where the file is to hold
-    one; `zoom` above 0: baked in any case, as cameras see it at so many times their resolution. local: positions
-    relative to the scene's origin.
+    camera: write only its splats. Without it a model without a standard form is baked. zoom above 0: bake in any case,
+    for cameras at so many times their resolution. local: positions relative to the scene's origin.
 
     Raises:
         InputError: the format cannot hold the splats, or the model cannot be baked.
@@ -79,7 +78,7 @@ def export(
     gaussians = Gaussians(**{name: value.detach().cpu() for name, value in vars(gaussians).items()})
     comments = [*notes(run), *stated, f"SplatRenderMode: {render_mode(run.raster)}"]
     if baked:
-        comments.append(f"splats as training cameras see them on average, at {zoom or 1:g} times their resolution")
+        comments.append(f"splats averaged over training cameras at {zoom or 1:g} times their resolution")
     if is_page(path):
         write_whole(path, page_of(run, gaussians, comments).encode())
     else:
@@ -91,23 +90,19 @@ def export(
 
 
 def log_axes_written(path: Path, spz: SpzForm) -> None:
-    """Logs the axes of a file whose reader may take it for others."""
+    """Log the axes of a .spz file, as readers differ in them."""
     if suffix_of(path) == ".spz":
         states = "which it states" if spz.version > 3 else "which version 3 cannot state"
         logger.info("%s: SPZ version %d, axes %s, %s", path, spz.version, spz.axes, states)
 
 
 def read_again(path: Path, spz: SpzForm = SPZ_FORM, origin: Origin = NO_ORIGIN) -> Gaussians:
-    """Reads a file that was written here, relative to an origin."""
+    """Read a file of `export` relative to an origin."""
     return around(read_splats(path, spz.axes if suffix_of(path) == ".spz" else AUTO).gaussians, origin)
 
 
 def explicit_of(run: Run, camera: Camera | None) -> Gaussians | None:
-    """Returns the splats of a backbone as they are; None: none hold for all cameras, but some can be baked.
-
-    Raises:
-        GsxError: neither.
-    """
+    """Return the splats of a backbone; None: they differ between cameras and can be baked; raise GsxError otherwise."""
     try:
         return run.backbone.explicit(camera, run.model_step)
     except GsxError:
@@ -117,51 +112,53 @@ def explicit_of(run: Run, camera: Camera | None) -> Gaussians | None:
 
 
 def own_columns(run: Run) -> dict[str, Float[Tensor, "N"]] | None:
-    """Returns columns of the file that the published code of the backbone writes; None: the standard ones."""
+    """Return the columns that the published code of the backbone writes; None: the standard ones."""
     return run.backbone.file_columns() if isinstance(run.backbone, WithOwnFile) else None
 
 
 def is_page(path: Path) -> bool:
-    """Returns whether a name is that of a page."""
+    """Return True for the name of a page."""
     return path.suffix.lower() == PAGE
 
 
 def refuse_export(path: Path, spz: SpzForm = SPZ_FORM) -> None:
-    """Raises InputError for a name whose format is not written, and for a form of .spz of another file."""
+    """Raise InputError for a format that is not written, and for options of .spz with another format."""
     if not is_page(path):
         refuse_suffix(path, (PAGE,))
     if spz != SPZ_FORM and suffix_of(path) != ".spz":
-        raise InputError(f"axes and version are of .spz files, not of {path}: leave them out, or write model.spz")
+        raise InputError(
+            f"--axes and --spz-version are for .spz files, not for {path}: leave them out, or write model.spz"
+        )
 
 
 def page_of(run: Run, gaussians: Gaussians, comments: Sequence[str]) -> str:
-    """Returns a page that starts at the first test view, or training view where none is held out."""
+    """Return a page that starts at the first test view, or training view if none is held out."""
     up = upright(torch.stack([view.camera.rotation for view in run.scene.train]).double())
     views, background = evaluation_views(run.scene)[:PAGE_VIEWS], run.scene.background.tolist()
     return viewer_page(gaussians, views, up, background, f"{run.scene.name}, gsx", comments)
 
 
 def evaluation_views(scene: Scene) -> Sequence[View]:
-    """Returns the test views of a scene, or its training views where none is held out."""
+    """Return the test views of a scene, or its training views if none is held out."""
     return scene.test or scene.train
 
 
 def notes(run: Run) -> list[str]:
-    """Returns what a viewer must know of the model."""
-    own = run.backbone if isinstance(run.backbone, WithOwnFile) else None
+    """Return comments for viewers: source, screen dilation, zoom rules, units."""
+    file_notes = run.backbone.file_notes() if isinstance(run.backbone, WithOwnFile) else ()
     return [
         f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
         f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
         *([f"trained around {in_words(run.scene.origin)}"] if any(run.scene.origin) else []),
         *zoomed_note(run.raster),
         *supersampling_note(run),
-        *(own.file_notes() if own else ()),
+        *file_notes,
         "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
     ]
 
 
 def zoomed_note(raster: RasterSettings) -> list[str]:
-    """Returns how cameras k times as fine as those of training draw, where they differ."""
+    """Return the rule for cameras k times as fine as those of training, if it differs."""
     finer = f"at k times the focal length of {raster.training_focal:.6g} px: dilation"
     if raster.zoomed == "magnified":
         return [f"{finer} {raster.dilation} k^2 px^2 for k > 1"]
@@ -172,17 +169,14 @@ def zoomed_note(raster: RasterSettings) -> list[str]:
 
 
 def supersampling_note(run: Run) -> list[str]:
-    """Returns through which finer pixels the model was trained, if any."""
+    """Return the supersampling of training, if any."""
     times = run.views.raster_scale(run.model_step)
     filter_ = run.scene.reduction.filter
     return [f"trained through renders {times} times as fine, reduced by the {filter_} filter"] if times > 1 else []
 
 
 def render_mode(raster: RasterSettings) -> str:
-    """Returns how viewers treat their screen dilation: `mip` compensates opacities for it, `default` does not.
-
-    Values of the comment SplatRenderMode, which Brush writes and SuperSplat reads.
-    """
+    """Return the value of SplatRenderMode (Brush, SuperSplat): `mip` compensates opacities for screen dilation."""
     return "mip" if raster.compensate else "default"
 
 
@@ -195,8 +189,8 @@ def losses(
     spz: SpzForm = SPZ_FORM,
     local: bool = False,
 ) -> list[str]:
-    """Returns what a standard file, read again, and baking have lost, in PSNR of renders of some views."""
-    views, inside = views[:LOOKED_AT], written.gaussians
+    """Report the loss by the file format and by baking, as PSNR of renders."""
+    views, inside = views[:LOSS_VIEWS], written.gaussians
     stated = local and suffix_of(path) in COMMENTED
     origin = NO_ORIGIN if local and not stated else run.scene.origin
     again = as_in_page(inside) if is_page(path) else read_again(path, spz, origin)
@@ -213,19 +207,19 @@ def losses(
         truth = [view.image().to(own[0]) for view in views]
         alike, model, baked = (mean_psnr(a, b) for a, b in ((before, own), (own, truth), (before, truth)))
         lines.append(
-            f"baked for all views: {alike:.1f} dB against the model; against photographs {baked:.2f} dB, where the "
-            f"model has {model:.2f} dB: {model - baked:.2f} dB lost"
+            f"baked for all views: {alike:.1f} dB against the model; {baked:.2f} dB against photos, the model has "
+            f"{model:.2f} dB: {model - baked:.2f} dB lost"
         )
     return lines
 
 
 def mean_psnr(pictures: Sequence[Float[Tensor, "3 H W"]], others: Sequence[Float[Tensor, "3 H W"]]) -> float:
-    """Returns the mean PSNR over pairs."""
+    """Return the mean PSNR over pairs."""
     return fmean(psnr(a, b) for a, b in zip(pictures, others, strict=True))
 
 
 def as_in_page(gaussians: Gaussians) -> Gaussians:
-    """Returns Gaussians as a page holds them, but not turned."""
+    """Return Gaussians after the compression of a page."""
     return gaussians_from(decode_compressed_ply(encode_compressed_ply(arrays_of(gaussians), ())))
 
 
@@ -233,10 +227,9 @@ def as_in_page(gaussians: Gaussians) -> Gaussians:
 
 
 def convert(source: Path, to: Path, axes: str = AUTO, spz: SpzForm = SPZ_FORM, local: bool = False) -> None:
-    """Writes the splats of a file as the kind that the other name says, with its mark for compensated opacities.
+    """Write the splats of a file in the format of another suffix, with its mark for compensated opacities.
 
-    axes: of the file that is read; spz: form of a .spz that is written; local: positions relative to an origin, where
-    they are far from (0, 0, 0).
+    axes: of `source`. spz: form of a .spz `to`. local: relative to an origin if positions are far from (0, 0, 0).
 
     Raises:
         InputError: one of them cannot be read or written, or both are the same file.
@@ -262,18 +255,18 @@ def convert(source: Path, to: Path, axes: str = AUTO, spz: SpzForm = SPZ_FORM, l
 # -- coordinates far from (0, 0, 0) ------------------------------------------------------------------------------------
 
 COMMENTED = (STANDARD, ".compressed.ply", ".glb", "")
-"""Suffixes of files that hold comments; empty: of pages, which do."""
+"""Suffixes of files with comments; empty: a page."""
 
 
 def placement(origin: Origin, local: bool) -> tuple[Origin, list[str]]:
-    """Returns (what is added to positions of a file, comments): the origin, or its statement in a `local` file."""
+    """Return (offset of a file's positions, comments): the origin, or a comment with it in a `local` file."""
     if not any(origin):
         return NO_ORIGIN, []
     return (NO_ORIGIN, [comment_of(origin)]) if local else (origin, [])
 
 
 def refuse_too_far(path: Path, gaussians: Gaussians, origin: Origin) -> None:
-    """Raises InputError for SPZ where it cannot hold coordinates, with the remedies that exports have."""
+    """Raise InputError for SPZ with coordinates beyond its range."""
     if not any(origin) or suffix_of(path) != ".spz" or not len(gaussians.means):
         return
     furthest = float(away(gaussians, origin).means.abs().max())
@@ -285,7 +278,7 @@ def refuse_too_far(path: Path, gaussians: Gaussians, origin: Origin) -> None:
 
 
 def log_coordinates(path: Path, origin: Origin, local: bool, gaussians: Gaussians | None = None) -> None:
-    """Logs in which coordinates the file of a scene far from (0, 0, 0) is, and what that costs."""
+    """Log the coordinates of a file of a scene far from (0, 0, 0), and their rounding."""
     if not any(origin):
         return
     suffix, middle = suffix_of(path), in_words(origin)
@@ -305,5 +298,5 @@ def log_coordinates(path: Path, origin: Origin, local: bool, gaussians: Gaussian
 
 
 def median_scale(gaussians: Gaussians) -> float:
-    """Returns the median standard deviation of Gaussians along their axes, scene units."""
+    """Return the median standard deviation of Gaussians along their axes, scene units."""
     return float(gaussians.log_scales.median().exp()) if len(gaussians.means) else 1.0

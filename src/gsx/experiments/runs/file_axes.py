@@ -1,4 +1,4 @@
-"""Axes of a splat file, chosen by the scene that it is to fit."""
+"""Axes of a splat file, chosen by its scene."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -34,29 +34,29 @@ from gsx.formats.splat_files import SplatContent, log_axes
 logger = logging.getLogger(__name__)
 
 OTHER = {SPECIFIED: TRAINED, TRAINED: SPECIFIED}
-"""The two systems that programs write; each is the other one turned by 180 degrees about x."""
+"""The two systems that programs write; they differ by 180 degrees about x."""
 NEARER = 1.5
-"""Ratio of distances from the scene's points from which on they decide."""
+"""Ratio of distances from the scene's points that decides."""
 MORE_IN_VIEW = 1.2
-"""Ratio of shares in view from which on they decide."""
+"""Ratio of shares in view that decides."""
 LEAST_IN_VIEW = 0.05
-"""Share in view of axes that are chosen: what lies elsewhere fits in no axes."""
+"""Least share in view: with less, neither axes fit."""
 MORE_ALIKE = 1.0
-"""Difference in PSNR of thumbnails, dB, from which on it decides."""
+"""Difference in PSNR of thumbnails that decides, dB."""
 THUMBNAIL, MOST_THUMBNAILS = 96, 4
-"""Longer side in px, and how many are compared."""
+"""Longer side in px, and number of thumbnails."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """Position of splats, in some axes, in a scene."""
+    """Fit of splats, in some axes, to a scene."""
 
     in_view: float
-    """Share of splats that a view has in front of it and within its picture, mean over views."""
+    """Share of splats inside the picture of a view, mean over views."""
     distance: float
-    """Median distance of the scene's points from the nearest splat, scene units; nan: it has none, or random ones."""
+    """Median distance of the scene's points from the nearest splat, scene units; NaN: no points, or random ones."""
     likeness: float = nan
-    """Mean PSNR of thumbnails against photos, dB; nan: not needed."""
+    """Mean PSNR of thumbnails against photos, dB; NaN: not needed."""
 
     def __str__(self) -> str:
         points = "" if isnan(self.distance) else f", points {self.distance:.3g} from the nearest splat"
@@ -65,10 +65,7 @@ class Fit:
 
 
 def in_axes_of(scene: Scene, content: SplatContent | None) -> Gaussians | None:
-    """Returns the Gaussians of a file, if there is one, in the axes that fit the scene where the file leaves them open.
-
-    Which axes are taken, why, and how to choose others go to the log.
-    """
+    """Return the Gaussians of a file in its axes, or in those that fit the scene if it states none; log the choice."""
     if content is None:
         return None
     other = OTHER.get(content.axes)
@@ -93,18 +90,14 @@ def in_axes_of(scene: Scene, content: SplatContent | None) -> Gaussians | None:
 def start_in_scene(
     settings: Settings, scene: Scene, content: SplatContent | None
 ) -> tuple[Gaussians | None, list[str]]:
-    """Returns the Gaussians of the file that a run begins with, as they lie in its scene, and doubts about them.
-
-    Raises:
-        InputError: no splat is in view.
-    """
+    """Return the Gaussians of the start file in the scene's coordinates, and doubts; errors as `start_doubts`."""
     gaussians = in_axes_of(scene, content)
     start = None if gaussians is None else in_scene(gaussians, scene)
     return start, start_doubts(settings, scene, start)
 
 
 def fit(gaussians: Gaussians, scene: Scene) -> Fit:
-    """Returns how Gaussians of a file lie in a scene."""
+    """Measure the fit of Gaussians of a file to a scene."""
     some = Gaussians(**{name: spread(value, MOST_SPLATS) for name, value in vars(gaussians).items()})
     some = around(some, origin_of_file(some, scene))
     views = [*scene.train, *scene.test]
@@ -116,10 +109,9 @@ def fit(gaussians: Gaussians, scene: Scene) -> Fit:
 
 
 def better(fits: dict[str, Fit]) -> str | None:
-    """Returns the axes of the better of two fits; None: undecided.
+    """Return the axes of the better of two fits; None: undecided.
 
-    Points decide where they are clearly nearer; else the share in view does, which a scene on a table top that is
-    turned over may leave as it was.
+    Clearly nearer points decide, else the share in view, which may stay equal when a table top is turned over.
     """
     (first, a), (second, b) = fits.items()
     if not in_view(fits):
@@ -132,12 +124,12 @@ def better(fits: dict[str, Fit]) -> str | None:
 
 
 def in_view(fits: dict[str, Fit]) -> bool:
-    """Returns whether splats are in view in some axes."""
+    """Return True if splats are in view in some axes."""
     return max(fit.in_view for fit in fits.values()) >= LEAST_IN_VIEW
 
 
 def likeness(gaussians: Gaussians, scene: Scene) -> float:
-    """Returns the mean PSNR of thumbnails of a file's Gaussians against those of photos, dB."""
+    """Return the mean PSNR of thumbnails of a file's Gaussians against those of photos, dB."""
     gaussians = around(gaussians, origin_of_file(gaussians, scene))
     views = [*scene.train, *scene.test]
     return fmean(
@@ -146,14 +138,14 @@ def likeness(gaussians: Gaussians, scene: Scene) -> float:
 
 
 def thumbnail_psnr(gaussians: Gaussians, view: View, background: Float[Tensor, "3"]) -> float:
-    """Returns the PSNR of a small render against a small photo, dB."""
+    """Return the PSNR of a small render against a small photo, dB."""
     camera = view.camera.zoom(min(1.0, THUMBNAIL / max(view.camera.size)))
     photo = torch.nn.functional.interpolate(view.image()[None], size=(camera.height, camera.width), mode="area")[0]
     return psnr(render_gaussians(gaussians, camera, RasterSettings(path="eager"), background), photo)
 
 
 def more_alike(fits: dict[str, Fit]) -> str | None:
-    """Returns the axes of the fit whose thumbnails are clearly more like photos; None: undecided."""
+    """Return the axes with a clearly higher PSNR of thumbnails; None: undecided."""
     (first, a), (second, b) = fits.items()
     if abs(a.likeness - b.likeness) < MORE_ALIKE:
         return None
@@ -161,20 +153,20 @@ def more_alike(fits: dict[str, Fit]) -> str | None:
 
 
 def log_choice(content: SplatContent, fits: dict[str, Fit], best: str | None) -> None:
-    """Logs the axes of a file that states none, and the evidence."""
+    """Log the axes of a file that states none, and the evidence."""
     evidence = "; ".join(f"{axes}: {fit}" for axes, fit in fits.items())
     if best:
-        message = "%s: axes %s, which fit the scene (%s); the file states none, axes=%s takes the others"
+        message = "%s: axes %s fit the scene (%s); the file states none; axes=%s chooses the others"
         logger.info(message, content.path, best, evidence, OTHER[best])
     else:
-        message = "%s: axes %s, as SPZ specifies; file and scene leave them open (%s): compare with axes=%s"
+        message = "%s: axes %s (SPZ standard); file and scene do not decide (%s): compare with axes=%s"
         logger.warning(message, content.path, content.axes, evidence, OTHER[content.axes])
 
 
 def log_doubt(content: SplatContent, fits: dict[str, Fit], other: str) -> None:
-    """Warns of a file of a format with usual axes that would fit the scene better in others."""
+    """Warn of a file that would fit the scene better in other axes than those usual for its format."""
     evidence = "; ".join(f"{axes}: {fit}" for axes, fit in fits.items())
     remedy = "export it with y up, as glTF has it" if content.by == FIXED else f"try axes={other}"
     logger.warning(
-        "%s: its splats would fit the scene better in axes %s (%s): %s", content.path, other, evidence, remedy
+        "%s: the splats would fit the scene better in axes %s (%s): %s", content.path, other, evidence, remedy
     )

@@ -1,4 +1,4 @@
-"""What a report shows beside held-out pictures: their depth, and a flight into the finest detail."""
+"""Further pictures of a report: depth of held-out views, and a flight into the finest detail."""
 
 from dataclasses import replace
 
@@ -15,21 +15,21 @@ from gsx.core.training.run import Run
 from gsx.experiments.reports.pictures import Pictures, colour_ramp
 
 FRAMES = 12
-"""Of the flight."""
+"""Frames of the flight."""
 LONGEST = 320
 """Longer side of its frames, px."""
 DEEPEST = 4.0
-"""Zoom it ends at where no finer truth is known."""
+"""Last zoom if no finer truth is known."""
 COVERED = 0.5
-"""Coverage from which on a pixel has a depth."""
+"""Least coverage of a pixel with depth."""
 INNER = 0.02
-"""Share of the nearest and of the farthest pixels that the colours of depth pass over."""
+"""Share of the nearest and of the farthest pixels beyond the range of depth colours."""
 ENOUGH = 1_000_000
-"""Pixels that these are estimated from."""
+"""Pixels from which that range is estimated."""
 
 
 def add_depth(run: Run, pictures: Pictures, pixels: int) -> None:
-    """Adds to each view of the report its depth, near bright, far dark, black where nothing is."""
+    """Add depth to each view of the report: near is bright, far is dark, nothing is black."""
     for number, entry in zip(sorted(pictures.shown), pictures.views, strict=True):
         picture, limits = depth_colours(*depth_and_coverage(run, run.scene.test[number].camera, pixels))
         entry["files"]["depth"] = pictures.save(f"{pictures.names[number]}.depth", picture)
@@ -37,7 +37,7 @@ def add_depth(run: Run, pictures: Pictures, pixels: int) -> None:
 
 
 def depth_and_coverage(run: Run, camera: Camera, pixels: int) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
-    """Returns (blending-weighted sum of camera z, coverage) of all but what stands behind the scene.
+    """Return (blending-weighted sum of camera z, coverage) of all splats but those behind the scene.
 
     They are drawn in place of colours, for which loops are compiled already.
     """
@@ -51,7 +51,7 @@ def depth_and_coverage(run: Run, camera: Camera, pixels: int) -> tuple[Float[Ten
 def depth_colours(
     summed: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"]
 ) -> tuple[Float[Tensor, "3 H W"], list[float]]:
-    """Returns (mean depth as colours, [nearest, farthest] in scene units); distances by their inverse."""
+    """Return (colours by inverse mean depth, [nearest, farthest] in scene units)."""
     covered = alpha > COVERED
     if not covered.any():
         return torch.zeros(3, *alpha.shape), []
@@ -64,7 +64,7 @@ def depth_colours(
 
 
 def add_flight(run: Run, pictures: Pictures, pixels: int) -> None:
-    """Adds a strip of frames, one below the other, from a whole view into its most detailed window."""
+    """Add a strip of frames, one below the other, from a whole view into its most detailed window."""
     number = min(pictures.shown)
     view = run.scene.test[number]
     place, zoom = goal(view, pictures)
@@ -75,7 +75,7 @@ def add_flight(run: Run, pictures: Pictures, pixels: int) -> None:
 
 
 def goal(view: View, pictures: Pictures) -> tuple[tuple[float, float], float]:
-    """Returns (end of the flight, as shares of the picture's sides; its zoom there): the window of the finest crop."""
+    """Return (end of the flight as shares of the picture's sides, its zoom there): the window of the finest crop."""
     crops = [crop for crop in pictures.crops if crop["view"] == view.name and crop["factor"] > 1]
     if not crops:
         return (0.5, 0.5), DEEPEST
@@ -87,7 +87,7 @@ def goal(view: View, pictures: Pictures) -> tuple[tuple[float, float], float]:
 
 
 def flight(camera: Camera, place: tuple[float, float], zoom: float) -> list[Camera]:
-    """Returns cameras of one raster that zoom evenly from the whole picture to `zoom` times the focal length."""
+    """Return cameras of one raster that zoom evenly from the whole picture to `zoom` times the focal length."""
     shrink = min(1.0, LONGEST / max(camera.size))
     width, height = (max(1, round(side * shrink)) for side in camera.size)
     small, cameras = camera.resize(width, height), []

@@ -1,7 +1,4 @@
-"""Stops a run that has gone bad: skips steps with a non-finite loss or gradient and names the culprit.
-
-A run on several processes is also stopped when these no longer hold the same model.
-"""
+"""Stops a broken run: skips steps with a non-finite loss or gradient, names its cause, and compares ranks."""
 
 import hashlib
 import logging
@@ -21,18 +18,14 @@ PATIENCE = 3
 
 
 class Guard:
-    """Listener: vetoes bad steps; the run ends with a checkpoint after three in a row."""
+    """Listener that skips bad steps, and ends the run with a checkpoint after PATIENCE in a row."""
 
     def __init__(self) -> None:
         self.in_a_row = 0
 
     @hookimpl
     def gsx_gradients_ready(self, run: Run, step: StepResult) -> str | None:
-        """The reason to skip the step, if any.
-
-        Raises:
-            TrainingError: this is the third bad step in a row.
-        """
+        """Return the reason to skip the step, if any; raise TrainingError at the third in a row."""
         reason = culprit(run, step)
         if reason is None:
             self.in_a_row = 0
@@ -48,11 +41,7 @@ class Guard:
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
-        """See that there is still a model.
-
-        Raises:
-            LostModel: its last primitive is gone.
-        """
+        """Raise LostModel if no primitive is left."""
         if len(run.backbone.table) == 0:
             raise LostModel(
                 f"no primitive is left after step {step.number}: lower the learning rates (backbone.rates), or the "
@@ -61,7 +50,7 @@ class Guard:
 
 
 def culprit(run: Run, step: StepResult) -> str | None:
-    """Names what is not finite: the loss, or a parameter's gradient with the number of rows concerned."""
+    """Name what is not finite: the loss, or a parameter's gradient with its number of rows."""
     by_name = gradients(run.backbone.table)
     # one read of the device: the loss, then the sum of every gradient
     loss, *sums = torch.stack([step.loss, *(gradient.sum() for gradient in by_name.values())]).tolist()
@@ -70,33 +59,28 @@ def culprit(run: Run, step: StepResult) -> str | None:
     for (name, gradient), total in zip(by_name.items(), sums, strict=True):
         if not math.isfinite(total):
             rows = int((~torch.isfinite(gradient)).reshape(len(gradient), -1).any(1).sum())
-            if rows == 0:  # every value is finite, only their sum overflowed
-                continue
-            return f"the gradient of {name} is not finite in {rows} of {len(gradient)} rows"
+            if rows:  # else every value is finite, only their sum overflowed
+                return f"the gradient of {name} is not finite in {rows} of {len(gradient)} rows"
     return None
 
 
 class Agreement:
-    """Listener: at the steps of checkpoints all ranks must hold the same state."""
+    """Listener that compares the state of all ranks at the steps of checkpoints."""
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
-        """Compare digests when due.
-
-        Raises:
-            Disagreement: they differ.
-        """
+        """Raise Disagreement if digests differ."""
         due = run.step % run.training.checkpoint_every == 0 or run.complete
         if due and run.ranks.size > 1 and len(set(run.ranks.all_gather(digest(run)))) > 1:
             raise Disagreement(
-                f"ranks disagree at step {run.step}: their models have drifted apart and none is kept; go on from the "
-                f"checkpoint before, if there is one, with {command('resume', run.folder)}"
+                f"ranks disagree at step {run.step}: their models have drifted apart and none is kept; continue from "
+                f"the checkpoint before, if there is one, with {command('resume', run.folder)}"
             )
 
 
 def digest(run: Run) -> str:
-    """Of everything that the next steps depend on."""
-    content = hashlib.sha256(repr((run.sampler.order, run.sampler.orders)).encode())
+    """Return a digest of all that the next steps depend on."""
+    content = hashlib.sha256(repr((run.sampler.order, run.sampler.begun)).encode())
     for name, value in sorted({"generator": run.generator.get_state(), **table_tensors(run.backbone.table)}.items()):
         content.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
     return content.hexdigest()

@@ -1,7 +1,7 @@
-"""Training views as a model shows them that was not fitted to them: half of the views, by one of the other half.
+"""Renders of training views by a model that was not fitted to them: each half of the views by the model of the other.
 
-The run's own renders of its training views are too clean to learn repair from. These have what renders of new places
-lack, and photographs to compare with (ours; every n-th view: Difix, Wu et al. 2025).
+A run's renders of its training views are too clean to learn repair from. These have the flaws of renders of new
+places, and photos to compare with (ours; every n-th view: Difix, Wu et al. 2025).
 """
 
 import logging
@@ -33,56 +33,55 @@ from gsx.experiments.runs.guard import Guard
 logger = logging.getLogger(__name__)
 
 HALVES = 2
-Anew: TypeAlias = Callable[[Scene, int, torch.Generator, TrainingViews], Backbone[Any]]
-"""(scene, steps, generator, how its views are seen) -> a backbone of the run's options at step 0."""
+NewBackbone: TypeAlias = Callable[[Scene, int, torch.Generator, TrainingViews], Backbone[Any]]
+"""(scene, steps, generator, training views) -> a backbone by the run's options at step 0."""
 
 
-def held_out_renders(run: Run, anew: Anew, share: float, seed: int) -> list[Float[Tensor, "3 h w"]]:
-    """The training views in order, each rendered by the model of the half without it, in 8 bits.
+def held_out_renders(run: Run, new_backbone: NewBackbone, share: float, seed: int) -> list[Float[Tensor, "3 h w"]]:
+    """Return the training views in order, each rendered in 8 bits by the model of the other half.
 
-    Each model begins anew and ends after `share` of the steps that the run has taken, by a schedule of that length. It
-    draws from generators of its own: the run goes on as if nothing had been. What is rendered is kept in the run's
-    folder until the next time.
+    Each model trains for `share` of the run's steps so far, by a schedule of that length and with its own generators:
+    the run itself is unchanged. The renders stay in the run's folder until the next event.
 
     Raises:
-        InputError: there are not two training views.
+        InputError: the scene has one training view.
     """
     if len(run.scene.train) < HALVES:
-        raise InputError(f"scene '{run.scene.name}' has one training view: half of that is nothing to learn from")
+        raise InputError(f"scene '{run.scene.name}' has one training view, which cannot be halved: add photos")
     steps = max(1, round(share * run.step))
     path = run.folder / "regenerators" / f"halves_{run.step:07d}_{steps}.safetensors"
     renders = read_renders(path, len(run.scene.train)) if path.is_file() else None
     if renders is None:
-        renders = made(run, anew, steps, seed)
+        renders = render_halves(run, new_backbone, steps, seed)
         write_renders(path, renders)
     return [render.float() / 255 for render in renders]
 
 
-def made(run: Run, anew: Anew, steps: int, seed: int) -> list[UInt8[Tensor, "3 h w"]]:
-    """The renders of both models."""
-    logger.info("two models of half of the training views each are trained for %d steps", steps)
-    begun, views = time.perf_counter(), run.train_views
-    shown: dict[int, Tensor] = {}
+def render_halves(run: Run, new_backbone: NewBackbone, steps: int, seed: int) -> list[UInt8[Tensor, "3 h w"]]:
+    """Train both models and return their renders of the views they were not trained on."""
+    logger.info("training two models on half of the training views each, for %d steps", steps)
+    started, views = time.perf_counter(), run.train_views
+    renders: dict[int, Tensor] = {}
     for half in range(HALVES):
-        model = trained(without(run, anew, half, steps, seed), run.raise_if_stopping)
+        model = trained(half_run(run, new_backbone, half, steps, seed), run.refuse_if_stopping)
         numbers = range(half, len(views), HALVES)
-        shown |= {n: to_uint8(run.as_photo(render(model, views[n].camera).image, views[n])) for n in numbers}
-    logger.info("each has rendered the views that it does not know, %.0f s", time.perf_counter() - begun)
-    return [shown[number] for number in range(len(views))]
+        renders |= {n: to_uint8(run.as_photo(render(model, views[n].camera).image, views[n])) for n in numbers}
+    logger.info("both models have rendered their held-out half, %.0f s", time.perf_counter() - started)
+    return [renders[number] for number in range(len(views))]
 
 
-def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
-    """A run like this one at its step 0, of so many steps, on the views of the other half alone."""
+def half_run(run: Run, new_backbone: NewBackbone, half: int, steps: int, seed: int) -> Run:
+    """Return a run like this one at step 0 of `steps`, without the training views of `half`."""
     views = [view for number, view in enumerate(run.train_views) if number % HALVES != half]
     scene = replace(run.scene, train=views, test=[])
-    own = derived_seed("halves", seed, run.step, half)
-    generator = torch.Generator().manual_seed(own)
+    half_seed = derived_seed("halves", seed, run.step, half)
+    generator = torch.Generator().manual_seed(half_seed)
     modules = {
         name: module.restarted(replace(module.context, scene=scene, iterations=steps))
         for name, module in run.modules.items()
     }
     training_views = TrainingViews(scene=scene, modules=modules)
-    backbone = anew(scene, steps, generator, training_views)
+    backbone = new_backbone(scene, steps, generator, training_views)
     return Run(
         config=run.config,
         folder=run.folder,
@@ -93,17 +92,15 @@ def without(run: Run, anew: Anew, half: int, steps: int, seed: int) -> Run:
         iterations=steps,
         photos=PhotoCache(run.device),
         generator=generator,
-        sampler=Sampler(len(views), own, batch=run.training.batch),
+        sampler=Sampler(len(views), half_seed, batch=run.training.batch),
     )
 
 
-def trained(run: Run, raise_if_stopping: Callable[[], None]) -> Run:
-    """The run at its end; nobody but the guard against numbers that are not finite listens.
-
-    `raise_if_stopping`: of the run that it is trained for.
+def trained(run: Run, refuse_if_stopping: Callable[[], None]) -> Run:
+    """Train to the end with the guard as only listener; `refuse_if_stopping`: of the run that it is trained for.
 
     Raises:
-        TrainingError: it was lost; the run that it is trained for is not.
+        TrainingError: this model was lost; that run is not.
     """
     plugins = load_plugins([], points=[])
     with plugins.listening([Guard()]):
@@ -116,11 +113,8 @@ def trained(run: Run, raise_if_stopping: Callable[[], None]) -> Run:
     return run
 
 
-# -- files -------------------------------------------------------------------------------------------------------------
-
-
 def write_renders(path: Path, renders: Sequence[UInt8[Tensor, "3 h w"]]) -> None:
-    """Keep renders in place of those of earlier events."""
+    """Write renders and remove those of earlier events."""
     from safetensors.torch import save
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -131,7 +125,7 @@ def write_renders(path: Path, renders: Sequence[UInt8[Tensor, "3 h w"]]) -> None
 
 
 def read_renders(path: Path, count: int) -> list[UInt8[Tensor, "3 h w"]] | None:
-    """Renders as `write_renders` left them; None if the file is damaged."""
+    """Read renders of `write_renders`; None if the file is damaged."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 
@@ -139,5 +133,5 @@ def read_renders(path: Path, count: int) -> list[UInt8[Tensor, "3 h w"]] | None:
         found = load(path.read_bytes())
         return [found[str(number)] for number in range(count)]
     except (OSError, SafetensorError, KeyError) as error:
-        logger.warning("%s cannot be read (%s): its renders are made again", path, error)
+        logger.warning("%s cannot be read (%s): rendering again", path, error)
         return None

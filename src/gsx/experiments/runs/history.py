@@ -1,6 +1,6 @@
-"""Differences of a run that goes on from how it began: logged, recorded, and refused where they make another run.
+"""Changes between the parts of a run: logged, recorded, and refused if they make it another run.
 
-environment.json holds how the run began, and under `history` what had changed each time that it went on.
+environment.json holds the circumstances of the start and, under `history`, the changes at each continuation.
 """
 
 import logging
@@ -29,18 +29,16 @@ COMPARED = (
 """Entries of environment.json that may change between the parts of a run; the bits of its results may, too."""
 FACTS = "environment.json"
 CAMERAS, EDITED = "cameras (poses, intrinsics, sizes)", "options (config.yaml was edited)"
-"""What says which run it is, in words."""
+"""Names of what identifies a run."""
 UNKNOWN = "unknown"
-"""The source that began a run whose environment.json is gone."""
+"""Source that started a run whose environment.json is lost."""
 
 
-def go_on(run: Run, settings: Settings, plugins: Plugins, changed: bool = False) -> None:
-    """Logs and records what a run that goes on finds changed; its folder still has the config.yaml of before.
-
-    What its former process left half-written is removed.
+def record_changes(run: Run, settings: Settings, plugins: Plugins, changed: bool = False) -> None:
+    """Log and record changes since the run stopped, and remove half-written files; config.yaml is still the old one.
 
     Raises:
-        InputError: it would be another run, and nobody said that it is meant to be `changed`.
+        InputError: cameras or options are those of another run, and `changed` does not allow that.
     """
     remove_partial(run.folder)
     files, facts = read_run(run.folder), environment(run, plugins, settings.idle)
@@ -48,14 +46,14 @@ def go_on(run: Run, settings: Settings, plugins: Plugins, changed: bool = False)
         write_anew(run, facts, files.problems.get(FACTS, f"{FACTS} is missing"))
         return
     before, now = circumstances(files.environment), circumstances(facts)
-    differences = {key: pair for key, pair in changes(before, now).items() if can_be_compared(key, before, now)}
+    differences = {key: pair for key, pair in changes(before, now).items() if comparable(key, before, now)}
     known = known_options(files.environment)
     edited = bool(known) and composition_key(files.config, "", settings.idle) not in known
     others = [other_options(files, settings, plugins, "source" in differences)] if edited else []
     if not changed:
         refuse_another(run, [*([CAMERAS] if "scene.cameras" in differences else []), *others])
     for words in others:
-        logger.warning("the run goes on with other %s", words)
+        logger.warning("continuing with other %s", words)
     if files.config:
         differences |= changes(trained(files.config, settings.idle), trained(run.config, settings.idle))
     for key, (then, value) in differences.items():
@@ -65,51 +63,51 @@ def go_on(run: Run, settings: Settings, plugins: Plugins, changed: bool = False)
 
 
 def circumstances(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the comparable entries of an environment.json, by dotted key, as they were last."""
+    """Return the latest comparable entries of an environment.json by dotted key."""
     last = flattened({key: facts[key] for key in COMPARED if key in facts})
     last |= {f"scene.{key}": value for key, value in part(dict(facts), "scene").items() if key in ("stamp", "cameras")}
-    if "source" in last:  # of all revisions that trained parts of it
+    if "source" in last:  # all revisions that trained parts of it, joined by +
         last["source"] = str(last["source"]).split("+")[-1]
     for entry in facts.get("history", []):
         last |= {key: now for key, (_, now) in part(entry, "changed").items()}
     return last
 
 
-def can_be_compared(key: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Returns whether an entry is known of both times; plugins come and go, where they are known at all."""
+def comparable(key: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Return True if an entry is known both times; a plugin may be new if plugins were recorded at all."""
     if key.startswith("plugins."):
         return any(other.startswith("plugins.") for other in before)
     return key in before and key in now
 
 
 def known_options(facts: Mapping[str, Any]) -> set[str]:
-    """Returns digests of all options of the run: config.yaml may lag behind a history that was written before it."""
+    """Return all digests of the run's options: a crash may leave config.yaml older than the history."""
     pairs = [part(entry, "changed").get("options", []) for entry in facts.get("history", [])]
     return {str(digest) for digest in (facts.get("options"), *(one for pair in pairs for one in pair)) if digest}
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Returns (before, now) of what has another value, by dotted key; None where there is no such entry."""
+    """Return (before, now) of each changed value by dotted key; None where there is no such entry."""
     then, later = flattened(before), flattened(now)
     keys = dict.fromkeys([*then, *later])
     return {key: (then.get(key), later.get(key)) for key in keys if then.get(key) != later.get(key)}
 
 
 def other_options(files: RunFiles, settings: Settings, plugins: Plugins, other_source: bool) -> str:
-    """Returns in words which options are not those of the run; another source may read the same file otherwise."""
+    """Name the options that changed; another revision of the source may read the same file differently."""
     if not other_source:
         return EDITED
     read = read_config(files.folder / "config.yaml", plugins).resolved
     keys = ", ".join(changes(trained(files.config, settings.idle), trained(read, settings.idle)))
-    named = f"; this one reads otherwise: {keys}" if keys else ""
-    return f"options (config.yaml was edited, or another revision of gsx's source told them apart otherwise{named})"
+    named = f"; this one reads differently: {keys}" if keys else ""
+    return f"options (config.yaml was edited, or another revision of gsx's source reads it differently{named})"
 
 
 def write_anew(run: Run, facts: dict[str, Any], problem: str) -> None:
-    """Logs and records that nobody knows what the run began with; a damaged file is kept beside the new one.
+    """Write a lost environment.json anew, log that the start is unknown, and keep a damaged file next to it.
 
     Raises:
-        OSError: the file is there, and cannot be read now.
+        OSError: the file exists but cannot be read now.
     """
     path = run.folder / FACTS
     with suppress(FileNotFoundError, ValueError):
@@ -117,8 +115,7 @@ def write_anew(run: Run, facts: dict[str, Any], problem: str) -> None:
     if path.exists():
         path.replace(next(p for n in range(1, 1000) if not (p := path.with_suffix(f".damaged_{n}")).exists()))
     logger.warning(
-        "%s, %s: whether the run goes on with the scene, options and versions that it began with is not known; that "
-        "file is written anew",
+        "%s, %s: cannot check whether scene, options and versions are those of the start; the file is written anew",
         *(run.folder, problem),
     )
     history = {"history": [entry_of(run, {FACTS: (problem, "written anew")})]}
@@ -126,26 +123,26 @@ def write_anew(run: Run, facts: dict[str, Any], problem: str) -> None:
 
 
 def refuse_another(run: Run, names: Sequence[str]) -> None:
-    """Raises InputError if something that defines a run differs."""
+    """Raise InputError if something that identifies a run differs."""
     if names:
         raise InputError(
-            f"{run.folder} was trained to step {run.step} with other {' and '.join(names)}: restore them, or go on all "
-            f"the same with {command('resume', run.folder, '--changed')}"
+            f"{run.folder} was trained to step {run.step} with other {' and '.join(names)}: restore them, or continue "
+            f"anyway with {command('resume', run.folder, '--changed')}"
         )
 
 
 def in_words(key: str, before: Any, now: Any) -> str:
-    """Returns a change in words."""
+    """Describe a change."""
     scene = {"scene.stamp": "files", "scene.cameras": "cameras"}
     if key in scene:
-        return f"{scene[key]} of the scene are not those that the run began with"
+        return f"{scene[key]} of the scene have changed since the run started"
     if key == "source":
-        return f"the run was begun by another revision of gsx's source ({before}, this is {now})"
-    return f"the run goes on with {key}={now}, before it was {before}"
+        return f"the run was started by another revision of gsx's source ({before}, this is {now})"
+    return f"continuing with {key}={now}, before it was {before}"
 
 
 def record(run: Run, facts: dict[str, Any], differences: Mapping[str, tuple[Any, Any]]) -> None:
-    """Adds to the history in environment.json, and this revision to those that trained the run."""
+    """Add changes to the history in environment.json, and this revision to its `source`."""
     if not differences:
         return
     source = str(facts.get("source", ""))
@@ -156,7 +153,7 @@ def record(run: Run, facts: dict[str, Any], differences: Mapping[str, tuple[Any,
 
 
 def entry_of(run: Run, differences: Mapping[str, tuple[Any, Any]]) -> dict[str, Any]:
-    """Returns what has changed now, for the history."""
+    """Return changes as an entry of the history."""
     return {
         "step": run.step,
         "at": datetime.now().isoformat(sep=" ", timespec="seconds"),

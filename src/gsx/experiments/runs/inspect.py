@@ -1,4 +1,4 @@
-"""What is in this folder? Answers `gsx scenes PATH`, also for folders that cannot be trained from."""
+"""Describes the content of a folder for `gsx scenes PATH`, also if it cannot be trained from."""
 
 import logging
 import shlex
@@ -15,7 +15,7 @@ from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import GsxError, InputError, command
 from gsx.core.files import expand_home
 from gsx.core.plugins import Component, Plugins
-from gsx.experiments.run_folder.files import BEGUN
+from gsx.experiments.run_folder.files import FIRST_FILES
 from gsx.experiments.runs.capture import capture_lines
 from gsx.experiments.runs.compose import compose_raw, hydra_session
 from gsx.experiments.runs.load_scene import in_one_place, measured
@@ -39,23 +39,23 @@ class Findings:
     lines: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     command: str = ""
-    """Trains the scene."""
+    """Command that trains the scene."""
 
     def add(self, lines: Iterable[str]) -> None:
-        """Adds lines as they are yielded; an error becomes a problem."""
+        """Add lines as they are yielded; an error becomes a problem."""
         try:
             for line in lines:
                 self.lines.append(line)
         except GsxError as problem:
             self.problems.append(str(problem))
-        except Exception as problem:  # whatever a folder holds, it is to be described
+        except Exception as problem:  # the content of a folder may break any reader
             self.problems.append(f"{type(problem).__name__}: {problem}")
 
 
 def describe(path: str | Path, plugins: Plugins, patient: bool = False) -> list[str]:
-    """Returns lines about a folder: format, cameras, images, points, capture, problems, and the command to train it.
+    """Return lines about a folder: format, cameras, images, points, capture, problems, and the command to train it.
 
-    patient: loads what takes minutes, too. Never raises.
+    patient: also load what takes minutes. Never raises.
     """
     path, findings = expand_home(path), Findings()
     loaders: Readable = []
@@ -69,76 +69,74 @@ def describe(path: str | Path, plugins: Plugins, patient: bool = False) -> list[
 
     findings.add(formats())
     if loaders:
-        loader, its = loaders[0]
-        findings.command = training_command(loader, path, {})
-        findings.add(scene_lines(loader, its, path, findings, plugins, patient))
+        findings.command = training_command(loaders[0][0], path, {})
+        findings.add(scene_lines(*loaders[0], path, findings, plugins, patient))
     problems = [f"problem   {problem}" for problem in findings.problems]
     label = "then" if problems else "train"
     return [*findings.lines, *problems, *([f"{label:10}{findings.command}"] if findings.command else [])]
 
 
 def scene_loaders(path: Path, plugins: Plugins) -> Readable:
-    """Returns the loaders that can read a folder, the most specific first.
+    """Return the loaders that can read a folder, the most specific first.
 
     Raises:
         InputError: there is none, or it is a run or a splat file.
     """
     refuse_run(path)
     refuse_splats(path)
-    loaders = readable(path, plugins)
-    if not loaders:
-        raise unknown(path, plugins)
-    return loaders
+    if loaders := readable(path, plugins):
+        return loaders
+    raise unknown(path, plugins)
 
 
 def readable(path: Path, plugins: Plugins) -> Readable:
-    """Returns the loaders that can read a folder, the most specific first; logs one that fails."""
+    """Return the loaders that can read a folder, the most specific first; log one that fails."""
     loaders: Readable = []
     for loader, its in plugins.registry.formats():
         try:
             if its.recognise(path):
                 loaders.append((loader, its))
-        except Exception as error:  # a plugin's; others may read it
-            logger.warning("scene=%s cannot look at %s (%s: %s)", loader.name, path, type(error).__name__, error)
+        except Exception as error:  # of a plugin; others may read it
+            logger.warning("scene=%s failed on %s (%s: %s)", loader.name, path, type(error).__name__, error)
     return loaders
 
 
 def refuse_run(path: Path) -> None:
-    """Raises InputError for the folder of a run, which is no scene."""
-    others = any((path / name).exists() for name in (*BEGUN, "checkpoints"))
+    """Raise InputError for a run folder."""
+    others = any((path / name).exists() for name in (*FIRST_FILES, "checkpoints"))
     if others and (path / "config.yaml").is_file():
-        looks = ", ".join(command(verb, path) for verb in ("view", "eval", "resume"))
-        raise InputError(f"{path} is a run: {looks}")
+        verbs = ", ".join(command(verb, path) for verb in ("view", "eval", "resume"))
+        raise InputError(f"{path} is a run, not a scene. Use it with {verbs}")
 
 
 def refuse_splats(path: Path) -> None:
-    """Raises InputError for a splat file or the folder of a SOG, whose pictures are no photos."""
+    """Raise InputError for a splat file or the folder of a SOG, whose pictures are not photos."""
     file = splat_file_at(path)
     if file.is_file() and suffix_of(file):
         kind = "a splat file" if path.is_file() else f"an unbundled SOG, whose pictures hold splats ({file.name})"
         raise InputError(
-            f"{path} is {kind}: {command('view', path)}, {command('eval', path)} scene=... scene.path=FOLDER, "
-            f"or train on with {shlex.quote(word_of('init', str(path)))} scene=... scene.path=FOLDER"
+            f"{path} is {kind}, not a scene. Use it with {command('view', path)}, {command('eval', path)} scene=... "
+            f"scene.path=FOLDER, or train on with {shlex.quote(word_of('init', str(path)))} scene=... scene.path=FOLDER"
         )
     if (path / SOG_PICTURE).is_file():
-        raise InputError(f"{path} holds pictures of a SOG ({SOG_PICTURE}) and no {META} that says so: copy it as well.")
+        raise InputError(f"{path} holds pictures of a SOG ({SOG_PICTURE}) but no {META}: copy that file as well.")
 
 
 def unknown(path: Path, plugins: Plugins) -> InputError:
-    """Returns the error for a folder that no loader reads, with what they look for."""
+    """Return the error for a folder that no loader reads, with the files that they look for."""
     if not path.is_dir():
-        return InputError(f"'{path}' is no folder: check the name.")
+        return InputError(f"'{path}' is not a folder: check the name.")
     inner = {folder.name: readable(folder, plugins) for folder in sorted(path.iterdir()) if folder.is_dir()}
     scenes = [f"{name} ({loaders[0][0].name})" for name, loaders in inner.items() if loaders]
     below = f" There are scenes below it: {', '.join(scenes)}." if scenes else ""
     signs = ", no ".join(its.sign for _, its in plugins.registry.formats())
-    return InputError(f"'{path}' is no scene: it has no {signs}.{below}")
+    return InputError(f"'{path}' is not a scene: it has no {signs}.{below}")
 
 
 def scene_lines(
     loader: Component, its: SceneFormat, path: Path, findings: Findings, plugins: Plugins, patient: bool
 ) -> Iterator[str]:
-    """Yields what lies in the folder, and what the loader makes of it."""
+    """Yield the content of a folder and of the scene that the loader makes of it."""
     yield from its.facts(path)
     overrides = its.overrides(path)
     findings.command = training_command(loader, path, overrides)
@@ -148,24 +146,24 @@ def scene_lines(
         yield from loaded_lines(scene)
         findings.add(capture_lines(scene))
     else:
-        yield f"poses     not known yet: {command('scenes', path, '--poses')} finds them and judges the coverage"
+        yield f"poses     unknown: {command('scenes', path, '--poses')} estimates them and checks coverage"
 
 
 def training_command(loader: Component, path: Path, overrides: Mapping[str, str]) -> str:
-    """Returns the command that trains a folder."""
+    """Return the command that trains from a folder."""
     more = [word_of(f"scene.{key}", value) for key, value in overrides.items()]
     return command(f"scene={loader.name}", word_of("scene.path", str(path)), *more)
 
 
 def options_for(loader: Component, path: Path, overrides: Mapping[str, str], plugins: Plugins) -> Any:
-    """Returns the options that this command means."""
+    """Return the scene options of that command."""
     with hydra_session(plugins):
         node = OmegaConf.merge(compose_raw([f"scene={loader.name}"]).scene, {"path": str(path)} | dict(overrides))
     return typed(loader.options, OmegaConf.to_container(node, resolve=True), "scene")
 
 
 def loaded_lines(scene: Scene) -> Iterator[str]:
-    """Yields what the loader made of it."""
+    """Yield views, split, points, extent and notes of a scene."""
     views = [*scene.train, *scene.test]
     for (width, height), count in sorted(Counter(view.camera.size for view in views).items()):
         yield f"views     {count} of {width}x{height}"

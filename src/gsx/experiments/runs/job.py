@@ -1,4 +1,4 @@
-"""A run from settings to its end as a program carries it out: signals, log file, and how to go on."""
+"""A run from settings to its end as a program carries it out: signals, log file, and how to continue."""
 
 import logging
 import signal
@@ -6,91 +6,84 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gsx.core.errors import ConfigError, command
 from gsx.core.files import remove_partial
+from gsx.core.plugins import Plugins, hookimpl
+from gsx.core.training.run import Run
 from gsx.engine.cache import in_use
 from gsx.engine.processes import processes, say
-from gsx.engine.signals import STOPPING, handled_signals
+from gsx.engine.signals import INTERRUPTED, STOPPING, handled_signals
+from gsx.experiments.reports.report import write_report
+from gsx.experiments.run_folder.claims import claimed, claimed_name
+from gsx.experiments.run_folder.files import reported
+from gsx.experiments.run_folder.run_key import place_of, scene_stamp
+from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.logs import logged_to
-
-if TYPE_CHECKING:
-    from gsx.core.plugins import Plugins
-    from gsx.core.training.run import Run
-    from gsx.experiments.runs.settings import Settings
+from gsx.experiments.runs.open import resume_or_start, start
+from gsx.experiments.runs.settings import Settings, named_code
 
 logger = logging.getLogger("gsx.cli")
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells report it."""
-
 
 @contextmanager
-def interruptible(run: "Run", onwards: str) -> Iterator[object]:
-    """Ends training after the current step at the first Ctrl-C, and the program at a second, or after training.
+def interruptible(run: Run, remedy: str) -> Iterator[object]:
+    """End training after the current step at the first Ctrl-C, and the program at a second, or after training.
 
-    The signals by which a cluster takes a machine back (STOPPING) end training, too; they may come again until the
-    checkpoint is written. Then the first is sent again, to whoever waited for it before; the log says how to go
-    `onwards`. Threads but the main one hear no signals.
+    The signals by which a cluster takes a machine back (STOPPING) end training, too, and may repeat until the
+    checkpoint is written. Then the first is raised again for its earlier handler; the log says how to continue
+    (`remedy`). Only the main thread receives signals.
 
     Yields:
         A listener that restores the handlers when training is over.
     """
-    from gsx.core.plugins import hookimpl
-
     received: list[int] = []
 
     def stop(number: int, frame: Any) -> None:
         run.progress.stopping = True
         received.append(number)
-        give_back(signal.SIGINT)
+        restore(signal.SIGINT)
 
-    def give_back(*numbers: int) -> None:
+    def restore(*numbers: int) -> None:
         for number in numbers:
             signal.signal(number, before[number])
 
     class UntilTrained:
-        @hookimpl(trylast=True)  # the checkpoint first
+        @hookimpl(trylast=True)  # after the checkpoint
         def gsx_training_finished(self) -> None:
-            give_back(*before)
+            restore(*before)
 
     main = threading.current_thread() is threading.main_thread()
     before = {int(number): signal.signal(number, stop) for number in (signal.SIGINT, *handled_signals()) if main}
     try:
         yield UntilTrained()
     finally:
-        give_back(*before)
+        restore(*before)
     if received and received[0] in STOPPING and not run.complete:
         name = signal.Signals(received[0]).name
-        logger.info("stopped at step %d by %s; go on with: %s", run.step, name, onwards)
+        logger.info("stopped at step %d by %s; continue with: %s", run.step, name, remedy)
         signal.raise_signal(received[0])
-        raise SystemExit(128 + received[0])  # it was not fatal: there is no result to hand over either way
+        raise SystemExit(128 + received[0])  # the handler returned: end all the same, there is no result
 
 
-def train(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
-    """Trains one composed experiment in a new folder, or goes on in that of its composition; `folders` learns which.
+def train(settings: Settings, loaded: Plugins, folders: list[Path]) -> int:
+    """Train a composition in a new folder or, with reuse=true, in its own; append that to `folders`.
 
-    Returns 0, or INTERRUPTED where it was stopped before its end.
+    Returns 0, or INTERRUPTED if training stopped early.
     """
-    from gsx.experiments.runs.open import start
-
     if settings.general.reuse:
-        return reused(settings, loaded, folders)
+        return train_rest(settings, loaded, folders)
     with in_use(), ExitStack() as claims:
         run = start(settings, loaded, claims)
         folders.append(run.folder)
         return carry_out(run, settings, loaded, keep_states=True)
 
 
-def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
-    """Trains what is left of a composition in its own folder; see `train`."""
-    from gsx.experiments.run_folder.claims import claimed_name
-    from gsx.experiments.run_folder.run_key import place_of, scene_stamp
-    from gsx.experiments.runs.open import resume_or_start
-
+def train_rest(settings: Settings, loaded: Plugins, folders: list[Path]) -> int:
+    """Train what is left of a composition in its own folder; see `train`."""
     if processes() > 1:
-        raise ConfigError("reuse=true is for one process: leave it out under torchrun, folder=NAME and `gsx resume` do")
+        raise ConfigError("reuse=true is for one process: with torchrun use folder=NAME and `gsx resume` instead")
     stamp = scene_stamp(settings.resolved)
     folder = place_of(settings.resolved, stamp, settings.idle)
     folders.append(folder)
@@ -103,33 +96,26 @@ def reused(settings: "Settings", loaded: "Plugins", folders: list[Path]) -> int:
 
 
 def finish_leftovers(folder: Path) -> None:
-    """Finishes what a process left of a finished run that was killed at its very end: partial files, no report.
+    """Remove partial files and write a missing report of a finished run that was killed at its very end.
 
     The folder's name must be claimed.
     """
-    from gsx.experiments.reports.report import write_report
-    from gsx.experiments.run_folder.claims import claimed
-    from gsx.experiments.run_folder.files import reported
-
     with claimed(folder):
         remove_partial(folder)
         if not reported(folder):
             write_report(folder)
 
 
-def carry_out(run: "Run", settings: "Settings", loaded: "Plugins", keep_states: bool = False) -> int:
-    """Trains to the end or to Ctrl-C, and says then how to go on; `keep_states`: see `execute`."""
-    from gsx.experiments.runs.execute import execute
-    from gsx.experiments.runs.settings import named_code
-
+def carry_out(run: Run, settings: Settings, loaded: Plugins, keep_states: bool = False) -> int:
+    """Train to the end or to Ctrl-C, and then print how to continue; `keep_states`: see `execute`."""
     trust = ["--trust"] if named_code(settings) else []
-    onwards = "the same command" if settings.general.reuse else command("resume", run.folder, *trust)
+    remedy = "the same command" if settings.general.reuse else command("resume", run.folder, *trust)
     try:
-        with interruptible(run, onwards) as listener, loaded.listening([listener]), logged_to(run.folder):
+        with interruptible(run, remedy) as listener, loaded.listening([listener]), logged_to(run.folder):
             execute(run, settings, loaded, keep_states)
         if run.complete:
             return 0
-        say(f"gsx: stopped at step {run.step}; go on with: {onwards}\n", as_error=True)
+        say(f"gsx: stopped at step {run.step}; continue with: {remedy}\n", as_error=True)
     except KeyboardInterrupt:
-        say(f"\ngsx: interrupted after step {run.step}; go on with: {onwards}\n", as_error=True)
+        say(f"\ngsx: interrupted after step {run.step}; continue with: {remedy}\n", as_error=True)
     return INTERRUPTED

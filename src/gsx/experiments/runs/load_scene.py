@@ -1,4 +1,4 @@
-"""A scene as a run needs it: in units that constants expect, with views to evaluate on."""
+"""Loads the scene of a run: in suitable units, with views to evaluate on."""
 
 import math
 from collections.abc import Sequence
@@ -22,40 +22,40 @@ from gsx.scenes.origin import around_origin, origin_of
 from gsx.scenes.posed import SAME_PLACE
 
 HIDDEN_SHARE, LARGEST_EXTENT = 0.02, 1e3
-"""If near planes hide more of the points, or cameras stand farther apart, units are not those that 3D-GS expects."""
+"""Largest share of points hidden by near planes, and extent, of units that 3D-GS expects."""
 
 
 def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
-    """Returns the scene, with views to evaluate on unless scene.split=none trains on all.
+    """Return the scene of a run, with test views unless scene.split=none trains on all.
 
-    origin: of the model that is at hand; None: the scene's own.
+    origin: of an existing model; None: the scene's own.
 
     Raises:
-        InputError: it cannot be loaded, its loader made no scene of it, the split leaves no test views, or cameras and
-            points are all in one place.
+        InputError: it cannot be loaded, its loader returned something else, the split leaves no test views, or cameras
+            and points are all in one place.
     """
     options = settings.scene.options
     loaded = checked(settings.scene.component.factory(options), settings.scene.component.name)
     loaded = replace(loaded, notes=[*loaded.notes, *count_notes(settings)])
-    unit = checked_unit(getattr(options, "unit", 1.0))
+    unit = getattr(options, "unit", 1.0)
+    if not 0 < unit < math.inf:  # options of a plugin may have any
+        raise ConfigError(f"scene.unit is {unit}; give a positive number")
     scene = warned_of_units(measured(placed(loaded, unit, origin)))
     if not scene.test:
         scene = held_out_none(scene, getattr(options, "split", ""))
     if not scene.extent > 0:
         raise InputError(
             f"all {len(scene.train)} training cameras of scene '{scene.name}' stand at one place, and no points lie "
-            "elsewhere, which gives no depth and no scale: use photos from different places"
+            "elsewhere, so depth and scale are unknown: use photos from different places"
         )
-    scene = with_more_points(scene, getattr(options, "fill", 0), settings.general.seed)
+    if count := getattr(options, "fill", 0):
+        generator = torch.Generator().manual_seed(derived_seed("fill", settings.general.seed))
+        scene = filled(scene, count, generator)
     return degrade(scene, getattr(options, "disturb", {}))
 
 
 def held_out_none(scene: Scene, rule: str) -> Scene:
-    """Returns a scene without test views, with a note that says so.
-
-    Raises:
-        InputError: its split is another than `none`.
-    """
+    """Return a scene without test views, with a note; raise InputError if its split is not `none`."""
     if rule != "none":
         raise InputError(
             f"scene '{scene.name}' has no test views to evaluate on: choose another scene.split, or none to train on "
@@ -65,10 +65,10 @@ def held_out_none(scene: Scene, rule: str) -> Scene:
 
 
 def checked(scene: Any, loader: str) -> Scene:
-    """Checks what a loader, maybe a plugin's, has returned.
+    """Return the scene of a loader, maybe a plugin's.
 
     Raises:
-        InputError: it is no scene that can be trained on and judged.
+        InputError: it is not a scene, or cannot be trained on and evaluated.
     """
     if not isinstance(scene, Scene):
         raise InputError(
@@ -77,31 +77,28 @@ def checked(scene: Any, loader: str) -> Scene:
     named, source = {view.name: view.camera for view in scene.train}, f"scene={loader} returned a scene"
     odd = [view.name for view in [*scene.train, *scene.test] if not finite(view.camera)]
     both = [view.name for view in scene.test if view.name in named and view.camera.has_pose_of(named[view.name])]
+    background = scene.background
     if not scene.train:
         raise InputError(f"{source} without training views: check the folder, or scene.split")
     if odd:
-        raise InputError(
-            f"{source} whose camera of '{odd[0]}' holds a value that is not finite: correct it, or leave it out"
-        )
+        raise InputError(f"{source} with a camera value that is not finite, of '{odd[0]}': correct it, or leave it out")
     if both:
-        raise InputError(f"{source} with '{both[0]}' to train on and to test on: a view is one or the other")
+        raise InputError(f"{source} with '{both[0]}' among training and test views: use it for one of them")
     if not bool(torch.isfinite(scene.points.positions).all()):
         raise InputError(f"{source} with points that are not finite: leave them out")
-    if scene.background.shape != (3,) or not bool(((scene.background >= 0) & (scene.background <= 1)).all()):
-        raise InputError(
-            f"{source} with a background of {scene.background.tolist()}: give red, green and blue in [0, 1]"
-        )
+    if background.shape != (3,) or not bool(((background >= 0) & (background <= 1)).all()):
+        raise InputError(f"{source} with a background of {background.tolist()}: give red, green and blue in [0, 1]")
     return scene
 
 
 def finite(camera: Camera) -> bool:
-    """Returns whether all numbers of a camera are finite."""
+    """Return True if all numbers of a camera are finite."""
     numbers = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
     return all(bool(torch.isfinite(values).all()) for values in (numbers, camera.rotation, camera.translation))
 
 
 def count_notes(settings: Settings) -> list[str]:
-    """Returns a note where the folder of a published scene holds another number of images than was published."""
+    """Return a note if the folder of a published scene holds another number of images than was published."""
     dataset, path = settings.dataset, getattr(settings.scene.options, "path", "")
     published = dataset.images.get(dataset.scene) if dataset else None
     if not (published and path):
@@ -111,57 +108,41 @@ def count_notes(settings: Settings) -> list[str]:
     return [] if count == published else [f"{images}/ holds {count} files, published are {published}: {compared}."]
 
 
-def with_more_points(scene: Scene, count: int, seed: int) -> Scene:
-    """Returns the scene with points where training views show none."""
-    if count == 0:
-        return scene
-    return filled(scene, count, torch.Generator().manual_seed(derived_seed("fill", seed)))
-
-
-def checked_unit(unit: float) -> float:
-    """Returns the unit.
-
-    Raises:
-        ConfigError: it is not a positive number.
-    """
-    if not 0 < unit < math.inf:
-        raise ConfigError(f"scene.unit is {unit}; give a positive number")
-    return unit
+# -- units -------------------------------------------------------------------------------------------------------------
 
 
 def placed(scene: Scene, unit: float, origin: Origin | None) -> Scene:
-    """Returns the scene around an origin, in units; origin: in these units, None: chosen by the scene."""
+    """Return the scene around an origin, in units; origin: in these units, None: chosen by the scene."""
     origin = scaled(origin_of(scene), unit) if origin is None else origin
     return replace(in_units(around_origin(scene, scaled(origin, 1 / unit)), unit), origin=origin)
 
 
 def scaled(origin: Origin, factor: float) -> Origin:
-    """Returns an origin in other units."""
+    """Return an origin in other units."""
     x, y, z = (value * factor for value in origin)
     return x, y, z
 
 
 def in_units(scene: Scene, unit: float) -> Scene:
-    """Returns the scene with positions of cameras and points multiplied by `unit`."""
+    """Return the scene with positions of cameras and points multiplied by `unit`."""
     if unit == 1:
         return scene
+
+    def rescaled(view: View) -> View:
+        return replace(view, camera=replace(view.camera, translation=view.camera.translation * unit))
+
     return replace(
         scene,
-        train=[rescaled(view, unit) for view in scene.train],
-        test=[rescaled(view, unit) for view in scene.test],
+        train=[rescaled(view) for view in scene.train],
+        test=[rescaled(view) for view in scene.test],
         points=replace(scene.points, positions=scene.points.positions * unit),
         extent=scene.extent * unit,
         notes=[*scene.notes, f"positions are multiplied by scene.unit={unit:g}"],
     )
 
 
-def rescaled(view: View, unit: float) -> View:
-    """Returns the view with its camera's position multiplied by `unit`."""
-    return replace(view, camera=replace(view.camera, translation=view.camera.translation * unit))
-
-
 def hidden_share(scene: Scene) -> float:
-    """Returns the share of the points in front of training cameras that their near planes hide."""
+    """Return the share of the points in front of training cameras that their near planes hide."""
     front = hidden = 0
     for view in scene.train:
         depth = view.camera.project(scene.points.positions)[1]
@@ -171,48 +152,47 @@ def hidden_share(scene: Scene) -> float:
 
 
 def warned_of_units(scene: Scene) -> Scene:
-    """Returns the scene, with a note if its units are far from those that published constants expect."""
+    """Return the scene, with a note if its units are far from those that published constants expect."""
     share = hidden_share(scene)
     if share <= HIDDEN_SHARE and scene.extent <= LARGEST_EXTENT:
         return scene
     odd = f"the extent is {scene.extent:.3g} scene units, and near planes hide {share:.0%} of the points before cameras"
     better = 10.0 ** -math.floor(math.log10(scene.extent)) if scene.extent > 0 else 1.0
-    return replace(
-        scene, notes=[*scene.notes, f"{odd}: published constants expect a few units, try scene.unit={better:g}"]
-    )
+    note = f"{odd}: published constants expect a few units, try scene.unit={better:g}"
+    return replace(scene, notes=[*scene.notes, note])
 
 
 def unit_of(run: Run) -> float:
-    """Returns what the scene's positions were multiplied by."""
+    """Return the factor of the scene's positions."""
     return float(run.config["scene"].get("unit", 1.0))
 
 
-# -- cameras in one place: the points alone say how large the scene is -------------------------------------------------
+# -- cameras in one place: only the points measure the scene -----------------------------------------------------------
 
 ONE_PLACE = 3e-5
-"""Extent of cameras, as a share of the points' median distance, that is rounding: at a focal length of 3,000 px they
-see points move by 0.1 px, which no reconstruction measures. Rounded poses are at 1e-6, close-ups above 1e-3."""
+"""Largest extent of cameras that is rounding, as a share of the points' median distance: at a focal length of 3,000 px
+points then move by 0.1 px, which no reconstruction measures. Rounded poses are at 1e-6, close-ups above 1e-3."""
 
 
 def point_distance(cameras: Sequence[Camera], points: PointCloud) -> float:
-    """Returns the median distance of the points from the first camera, scene units; 0 without points."""
+    """Return the median distance of the points from the first camera, scene units; 0 without points."""
     if len(points) == 0:
         return 0.0
     return float(offsets_from(points.positions, cameras[0].centre).norm(dim=1).median())
 
 
 def rounding_extent(cameras: Sequence[Camera], points: PointCloud) -> float:
-    """Returns the largest extent that is rounding: by the points' distances, or without points in scene units."""
+    """Return the largest extent that is rounding: by the points' distances, or without points in scene units."""
     return ONE_PLACE * point_distance(cameras, points) if len(points) else SAME_PLACE
 
 
 def in_one_place(cameras: Sequence[Camera], points: PointCloud) -> bool:
-    """Returns whether distances between cameras are rounding."""
+    """Return True if distances between cameras are rounding."""
     return extent_of(cameras) <= rounding_extent(cameras, points)
 
 
 def measured(scene: Scene) -> Scene:
-    """Returns the scene; if its training cameras stand in one place, its extent is 1.1 x the points' median distance.
+    """Return the scene; if its training cameras stand in one place, its extent is 1.1 x the points' median distance.
 
     Without points, such a scene has the extent 0.
     """

@@ -1,4 +1,4 @@
-"""Messages of gsx's log for people: on standard error, and in a run's log.txt."""
+"""Output of gsx's log: on standard error, and in a run's log.txt."""
 
 import logging
 import sys
@@ -10,16 +10,16 @@ from gsx.engine.processes import speaks
 
 
 class Plain(logging.Formatter):
-    """Messages as they are, warnings marked."""
+    """Messages as they are; warnings and errors with their level."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Returns a message in one line."""
+        """Return a message in one line."""
         mark = f"{record.levelname.lower()}: " if record.levelno > logging.INFO else ""
         return mark + record.getMessage()
 
 
 def set_up_logging() -> None:
-    """Shows plain messages of gsx on standard error."""
+    """Show plain messages of gsx on standard error."""
     root = logging.getLogger("gsx")
     root.setLevel(logging.INFO)
     root.propagate = False
@@ -28,16 +28,14 @@ def set_up_logging() -> None:
 
 @contextmanager
 def logged_to(folder: Path) -> Iterator[None]:
-    """Also writes messages to the run's log.txt."""
+    """Also write messages to the run's log.txt."""
     if not speaks():
         yield
         return
-    handler = quiet(
-        logging.FileHandler(folder / "log.txt", encoding="utf-8", errors="backslashreplace"),
-        logging.Formatter("%(asctime)s %(levelname)s %(message)s"),
-    )
+    file = logging.FileHandler(folder / "log.txt", encoding="utf-8", errors="backslashreplace")
+    handler = quiet(file, logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     root = logging.getLogger("gsx")
-    if root.level == logging.NOTSET:  # from Python, where nobody has set up messages
+    if root.level == logging.NOTSET:  # called from Python without set_up_logging
         root.setLevel(logging.INFO)
     root.addHandler(handler)
     try:
@@ -48,7 +46,7 @@ def logged_to(folder: Path) -> Iterator[None]:
 
 
 def quiet(handler: logging.Handler, formatter: logging.Formatter) -> logging.Handler:
-    """Returns a handler that says nothing of a full disk or a closed terminal: an error elsewhere does."""
+    """Return the handler; it ignores a full disk or a closed terminal, which raise errors elsewhere."""
     handler.setFormatter(formatter)
     handler.handleError = lambda record: None  # type: ignore[method-assign]
     return handler

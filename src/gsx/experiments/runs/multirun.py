@@ -21,15 +21,11 @@ from gsx.experiments.runs.settings import settings_from
 FULL_ERROR = "HYDRA_FULL_ERROR"
 MOST_COUNTED = 1000
 """Values of a sweep that are counted."""
+Job = Callable[[DictConfig], Any]
 
 
-def launch_jobs(
-    overrides: Sequence[str], folder: Path, jobs: Sequence[Sequence[str]], job: Callable[[DictConfig], Any]
-) -> None:
-    """Carries out jobs, each given by its overrides, by the launcher that `overrides` choose, inside a session.
-
-    What the launcher writes goes to `folder`.
-    """
+def launch_jobs(overrides: Sequence[str], folder: Path, jobs: Sequence[Sequence[str]], job: Job) -> None:
+    """Run jobs (lists of overrides) by the launcher of `overrides`, inside a session; its output goes to `folder`."""
     from hydra import compose as hydra_compose
     from hydra._internal.callbacks import Callbacks
     from hydra.core.global_hydra import GlobalHydra
@@ -44,13 +40,13 @@ def launch_jobs(
     launcher = HydraPlugins.instance().instantiate_launcher(hydra_context=context, task_function=job, config=config)
     with waiting_for_all(folder):
         for result in launcher.launch([list(words) for words in jobs], initial_job_idx=0):
-            _ = result.return_value  # raises what a job raised
+            _ = result.return_value  # raises the error of a job
 
 
 def processes_for(jobs: int, limit: int) -> int:
-    """Returns how many processes joblib's launcher starts, at most one for each job.
+    """Return the number of processes of joblib's launcher, at most one per job.
 
-    The cores are divided among all of them, and a signal to one without a job would end the others.
+    All of them share the cores, and a signal to one without a job would end the others.
     """
     from joblib import effective_n_jobs
 
@@ -58,10 +54,10 @@ def processes_for(jobs: int, limit: int) -> int:
 
 
 def check_overrides(overrides: Sequence[str], plugins: Plugins) -> tuple[Path, list[str]]:
-    """Refuses wrong groups, keys and values of a multirun before Hydra starts it.
+    """Refuse wrong groups, keys and values of a multirun before Hydra starts it.
 
-    Each choice of a swept group is composed with the first of all other values that are swept. Returns (the folder that
-    its runs go to, overrides of its launcher for as many runs).
+    Composes each choice of a swept group with the first value of every other sweep. Returns (output folder of the
+    runs, overrides of the launcher for as many runs).
     """
     refuse_absent_slurm(overrides)
     with hydra_session(plugins):
@@ -77,7 +73,7 @@ def check_overrides(overrides: Sequence[str], plugins: Plugins) -> tuple[Path, l
 
 
 def launcher_for(jobs: int, overrides: Sequence[str]) -> list[str]:
-    """Returns overrides of the launcher for so many jobs."""
+    """Return overrides of the launcher for so many jobs."""
     from hydra import compose as hydra_compose
 
     launcher = hydra_compose("config", overrides=list(overrides), return_hydra_config=True).hydra.launcher
@@ -85,24 +81,24 @@ def launcher_for(jobs: int, overrides: Sequence[str]) -> list[str]:
 
 
 def size_of_sweep(override: Any) -> int:
-    """Returns how many values an override has, up to MOST_COUNTED."""
+    """Return the number of values of an override, up to MOST_COUNTED."""
     return len(list(islice(override.sweep_string_iterator(), MOST_COUNTED))) if override.is_sweep_override() else 1
 
 
 def refuse_one_folder(overrides: Sequence[Any]) -> None:
-    """Raises ConfigError for a sweep whose runs would all go to one folder."""
+    """Raise ConfigError for a sweep whose runs would all go to one folder."""
     sweeps = any(one.is_sweep_override() for one in overrides)
     for one in overrides:
         if sweeps and one.key_or_group == "folder" and not one.is_sweep_override() and "${" not in one.input_line:
-            remedy = "give output=FOLDER, or a name with what they differ in, 'folder=FOLDER/${seed}'"
+            remedy = "give output=FOLDER, or a name with their difference, 'folder=FOLDER/${seed}'"
             raise ConfigError(f"{one.input_line} is for one run, and these are several: {remedy}")
 
 
 def words_of(override: Any, every: bool) -> list[str]:
-    """Returns an override by each of the values that it sweeps, or by the first; itself where it sweeps none.
+    """Return an override with each value of its sweep, or with the first; itself if it does not sweep.
 
     Raises:
-        ConfigError: it sweeps nothing that is known before Hydra starts.
+        ConfigError: it sweeps no value, or values that are unknown before Hydra starts.
     """
     from hydra.errors import HydraException
 
@@ -118,8 +114,8 @@ def words_of(override: Any, every: bool) -> list[str]:
     return [f"{override.get_key_element()}={value}" for value in values]
 
 
-def hydra_main(arguments: Sequence[str], plugins: Plugins, job: Callable[[DictConfig], Any]) -> None:
-    """Runs Hydra's command line on our configuration; launchers that start processes import `job`."""
+def hydra_main(arguments: Sequence[str], plugins: Plugins, job: Job) -> None:
+    """Run Hydra's command line on our configuration; launchers that start processes import `job`."""
     import hydra
 
     config_files.register(plugins.config_paths)
@@ -127,20 +123,20 @@ def hydra_main(arguments: Sequence[str], plugins: Plugins, job: Callable[[DictCo
     hydra.main(**version_base(), config_path=f"pkg://{MODULE}", config_name="config")(job)()
 
 
-def launch(arguments: Sequence[str], plugins: Plugins, job: Callable[[DictConfig], Any]) -> None:
-    """Runs the jobs of a multirun by Hydra's launcher.
+def launch(arguments: Sequence[str], plugins: Plugins, job: Job) -> None:
+    """Run the jobs of a multirun by Hydra's launcher.
 
     Raises:
         ConfigError: the launcher failed. Errors of gsx and of the file system stay as they are.
     """
     before = os.environ.get(FULL_ERROR)
-    os.environ[FULL_ERROR] = "1"  # or Hydra prints a traceback and ends the program
+    os.environ[FULL_ERROR] = "1"  # otherwise Hydra prints a traceback and ends the program
     try:
         hydra_main(arguments, plugins, job)
     except (GsxError, OSError):
         raise
     except Exception as error:
-        remedy = "mend its settings, or choose hydra/launcher=basic: one run after the other, here"
+        remedy = "correct its settings, or run one after the other here with hydra/launcher=basic"
         raise ConfigError(f"the launcher failed ({type(error).__name__}: {first_line(error)}): {remedy}") from error
     finally:
         os.environ.pop(FULL_ERROR, None)
@@ -148,7 +144,7 @@ def launch(arguments: Sequence[str], plugins: Plugins, job: Callable[[DictConfig
 
 
 def job_place() -> tuple[Path, int] | None:
-    """Returns (folder of the multirun, number in it) of the job that runs in this process; None outside of one."""
+    """Return (folder of the multirun, number in it) of the job that runs in this process; None outside of one."""
     from hydra.core.hydra_config import HydraConfig
 
     if not HydraConfig.initialized() or OmegaConf.is_missing(HydraConfig.get().job, "num"):

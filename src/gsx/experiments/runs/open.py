@@ -1,16 +1,16 @@
-"""The folder of a run: made for a new one, opened again, and gone on with."""
+"""Run folders: created for a new run, opened again, continued."""
 
 import logging
 import shutil
-from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
 from gsx.core.data.scene import Scene
 from gsx.core.errors import CheckpointError, ConfigError, InputError, command
-from gsx.core.files import read_json, sync_folder, write_json
+from gsx.core.files import keep_names, read_json, remove_partial, write_json
 from gsx.core.packages import require
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
@@ -29,10 +29,11 @@ from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.build import build, choose_device, refuse_uneven
 from gsx.experiments.runs.environment import environment
 from gsx.experiments.runs.file_axes import start_in_scene
-from gsx.experiments.runs.history import go_on
+from gsx.experiments.runs.history import record_changes
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.overrides import key_of
 from gsx.experiments.runs.progress import read_curves
+from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.saved_settings import read_config, value_of, write_config
 from gsx.experiments.runs.settings import Settings, named_code
 from gsx.experiments.runs.start_file import starting_splats
@@ -44,37 +45,35 @@ from gsx.formats.suffixes import SUFFIXES, suffix_of
 logger = logging.getLogger(__name__)
 
 OF_TRAINING = ("iterations", "length", "seed", "init", "axes", "reuse", "warm_start_at", "output", "folder")
-"""How long a run is trained, from what, and where it goes: nothing of what it shows once it is there."""
+"""Keys that change how and where a run is trained, and no figure of a trained run."""
+
+
+# -- a new run ---------------------------------------------------------------------------------------------------------
 
 
 def refuse_used(folder: str, remedy: str = "") -> None:
-    """Raises InputError if the run folder exists and holds something; `remedy`: of verbs that do not train."""
+    """Raise InputError if the run folder exists and is not empty; `remedy`: for verbs that do not train."""
     path = Path(folder)
     if folder and path.exists() and not path.is_dir():
-        raise InputError(f"'{folder}' is a file, no folder for a run: choose another place")
+        raise InputError(f"'{folder}' is a file, not a folder for a run: choose another place")
     if folder and path.exists() and any(one.name != LOCK for one in path.iterdir()):
-        remedy = remedy or f"choose another, or go on with `{command('resume', folder)}`"
+        remedy = remedy or f"choose another, or continue it with `{command('resume', folder)}`"
         raise InputError(f"'{folder}' is not empty: {remedy}")
 
 
 def new_folder(settings: Settings, scene: Scene) -> Path:
-    """Makes the folder of a new run."""
+    """Make the folder of a new run."""
     if settings.general.folder:
         folder = Path(settings.general.folder)
         folder.mkdir(parents=True, exist_ok=True)
-        sync_folder(folder.parent)
-        return folder
-    folder = stamped_folder(Path(settings.general.output) / scene.name / settings.backbone.component.name)
-    sync_folder(folder.parent)
+    else:
+        folder = stamped_folder(Path(settings.general.output) / scene.name / settings.backbone.component.name)
+    keep_names(folder.parent)
     return folder
 
 
 def stamped_folder(parent: Path) -> Path:
-    """Makes a folder named by the time.
-
-    Raises:
-        InputError: no free name was found.
-    """
+    """Make a folder named by the time."""
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     for suffix in ("", *(f"_{n}" for n in range(2, 1000))):
         with suppress(FileExistsError):  # another began in the same second
@@ -85,37 +84,39 @@ def stamped_folder(parent: Path) -> Path:
 
 @gc_paused()
 def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None) -> Run:
-    """Loads the scene and builds a run in a new folder, with config.yaml and environment.json written.
+    """Load the scene and build a run in a new folder, with config.yaml and environment.json.
 
-    Of several processes the first does what concerns the folder, which is claimed as long as `claims` lasts.
+    Rank 0 makes the folder and claims it until `claims` closes.
 
     Raises:
-        ConfigError, InputError: something is wrong; no folder was made.
+        ConfigError, InputError: a setting or the scene is wrong; no folder was made.
     """
     ranks = current_ranks()
-    choose_device(settings.general.device)  # an unknown one is refused now
+    choose_device(settings.general.device)  # refuses an unknown one before the scene is loaded
     ranks.broadcast(lambda: refuse_used(settings.general.folder))
     refuse_uneven(settings.training.batch, ranks)
-    load_lpips(settings.evaluation.lpips)  # wrong weights are refused now, not after training
-    build_trackers(settings.trackers)  # the same: a missing package
+    load_lpips(settings.evaluation.lpips)  # refuses wrong weights now, not after training
+    build_trackers(settings.trackers)  # the same for a missing package
     if settings.general.viewer:
         require("viewer=true", ("viser",), "gsx[viewer]")
     content = starting_splats(settings)
     scene = ranks.rank0_first(lambda: verified(load_scene(settings)))
     start, doubts = start_in_scene(settings, scene, content)
     run = build(settings, scene, Path(), training=True, start=start)
-    run.folder = ranks.broadcast(lambda: begun(run, settings, plugins, claims, doubts))
+    run.folder = ranks.broadcast(lambda: make_folder(run, settings, plugins, claims, doubts))
     if not ranks.first and checkpoint.sidecars(run.folder / "checkpoints"):  # of an earlier run
         checkpoint.restore(run, training=True)
     return run
 
 
-def begun(run: Run, settings: Settings, plugins: Plugins, claims: ExitStack | None, doubts: Sequence[str] = ()) -> Path:
-    """Makes the folder of a new run, with its first files; with `init=warm_start` it is at the state of another run."""
+def make_folder(
+    run: Run, settings: Settings, plugins: Plugins, claims: ExitStack | None, doubts: Sequence[str]
+) -> Path:
+    """Make the folder of a new run with its first files; with `init=warm_start` bring the run to a kept state."""
     run.folder = new_folder(settings, run.scene)
     if claims is not None:
         claims.enter_context(claimed(run.folder))
-        refuse_used(settings.general.folder)  # by another process that was faster
+        refuse_used(settings.general.folder)  # another process may have been faster
     try:
         write_config(run.folder / "config.yaml", settings.resolved)
         facts = environment(run, plugins, settings.idle) | ({"start": doubts} if doubts else {})
@@ -129,43 +130,46 @@ def begun(run: Run, settings: Settings, plugins: Plugins, claims: ExitStack | No
     return run.folder
 
 
+# -- an existing run ---------------------------------------------------------------------------------------------------
+
+
 def refuse_other(folder: Path) -> None:
-    """Raises InputError for a path that is no run."""
+    """Raise InputError for a path that is not a run folder."""
     if folder.is_file():
         name = "" if suffix_of(folder) else f". If it holds splats, let its name end in one of {', '.join(SUFFIXES)}"
-        raise InputError(f"{folder} is a file and no run folder: give a folder that `gsx` made{name}")
+        raise InputError(f"{folder} is a file, not a run folder: give a folder that `gsx` made{name}")
     if not (folder / "config.yaml").is_file():
-        raise InputError(f"{folder} is no run folder (it has no config.yaml): give a folder that `gsx` made")
+        raise InputError(f"{folder} is not a run folder (it has no config.yaml): give a folder that `gsx` made")
 
 
 def refuse_training(folder: Path, overrides: Sequence[str]) -> None:
-    """Raises ConfigError for an override that changes how or where a run is trained, and no figure of it."""
+    """Raise ConfigError for an override of OF_TRAINING."""
     for word in overrides:
         if key_of(word) in OF_TRAINING:
             longer = f"; {command('resume', folder, word)} trains on" if key_of(word) == "iterations" else ""
-            raise ConfigError(
-                f"'{word}' is for training, and changes nothing of what {folder} shows: leave it out{longer}"
-            )
+            raise ConfigError(f"'{word}' is for training and does not change what {folder} shows: leave it out{longer}")
 
 
 def refuse_code(folder: Path, settings: Settings, overrides: Sequence[str]) -> None:
-    """Raises InputError for a folder that names code to be run, unless the command line names the same."""
+    """Raise InputError for a folder that names code to run, unless the command line names the same."""
     words = [word.partition("=") for word in overrides]
     for key, code in named_code(settings).items():
         if code not in [str(value_of(value)) for name, _, value in words if name.startswith(f"{key}.")]:
             raise InputError(
-                f"{folder / 'config.yaml'} runs code, {key}: '{code}', which would have all your rights: look at it "
-                f"first, then `{command('resume', folder, '--trust')}`"
+                f"{folder / 'config.yaml'} runs code with your permissions, {key}: '{code}': check it first, then use "
+                f"`{command('resume', folder, '--trust')}`"
             )
 
 
 def open_run(
     folder: Path, plugins: Plugins, overrides: Sequence[str] = (), training: bool = False, trusted: bool = False
 ) -> tuple[Run, Settings]:
-    """Returns a run as its newest checkpoint left it; `training`: it goes on; `trusted`: it may run code that it names.
+    """Return a run at its newest checkpoint, and its settings.
+
+    training: it will be trained. trusted: it may run code that its settings name.
 
     Raises:
-        InputError: the folder is no run, or names code and is not trusted.
+        InputError: the folder is not a run, or names code and is not trusted.
         CheckpointError: there is no usable checkpoint.
     """
     refuse_other(folder)
@@ -175,11 +179,32 @@ def open_run(
     return restored(settings, folder, training), settings
 
 
-def trained_origin(folder: Path) -> Origin | None:
-    """Returns the origin of positions in a run's checkpoints.
+@contextmanager
+def reopened(folder: Path, plugins: Plugins, overrides: Sequence[str]) -> Iterator[tuple[Run, Settings]]:
+    """Claim a run folder and open its run to measure it again, drawn by the rasterizer path of its training.
 
-    None: no checkpoint can be read; `checkpoint.restore` says why.
+    Raises:
+        ConfigError, InputError: an override is wrong, the folder is not a run, or another process uses it.
+        CheckpointError: there is no usable checkpoint.
     """
+    refuse_other(folder)
+    refuse_training(folder, overrides)
+    with claimed(folder):
+        remove_partial(folder)
+        run, settings = open_run(folder, plugins, overrides)
+        run.raster = as_trained(run)
+        warm(run)
+        yield run, settings
+
+
+def as_trained(run: Run) -> RasterSettings:
+    """Return the rasterizer settings of a run with path=auto as its training chose it: times are then comparable."""
+    path = read_run(run.folder).environment.get("rasterizer")
+    return replace(run.raster, path=path) if run.raster.path == "auto" and path == "compiled" else run.raster
+
+
+def trained_origin(folder: Path) -> Origin | None:
+    """Return the origin of positions in a run's checkpoints; None if no checkpoint can be read."""
     for sidecar in reversed(checkpoint.sidecars(folder / "checkpoints")):
         with suppress(OSError, ValueError, AttributeError, TypeError):
             x, y, z = map(float, read_json(sidecar).get("origin", NO_ORIGIN))
@@ -188,28 +213,31 @@ def trained_origin(folder: Path) -> Origin | None:
 
 
 def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
-    """Returns the run of a folder, by these settings, as its newest checkpoint left it; see `open_run`."""
+    """Build the run of a folder by these settings and restore its newest checkpoint; see `open_run`."""
     origin = trained_origin(folder)
     checked = verified if training else (lambda scene: scene)
     scene = current_ranks().rank0_first(lambda: checked(load_scene(settings, origin)))
     run = build(settings, scene, folder, training, begins=False)
     checkpoint.restore(run, training)
     focal = read_run(folder).environment.get("training_focal")
-    if run.raster.training_focal and is_number(focal):  # the scene may be looked at in another size
+    if run.raster.training_focal and is_number(focal):  # the scene may be loaded in another size
         run.raster = run.backbone.raster = replace(run.raster, training_focal=float(focal))
     run.progress.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
     recall_accounts(run.augmenters, run.progress.curves)
     return run
 
 
-def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: ExitStack) -> Run | None:
-    """Returns the run of a composition as far as it has come; None: it is finished. `stamp`: of its scene.
+# -- a run named by its composition (reuse=true) -----------------------------------------------------------------------
 
-    What was evaluated by other settings is evaluated anew. The folder's name must be claimed (`claimed_name`); the
-    folder is, as long as `claims` lasts.
+
+def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: ExitStack) -> Run | None:
+    """Return the run of a composition at its last step; None if it is finished. `stamp`: of its scene.
+
+    A run that was evaluated by other settings is evaluated anew. The caller holds the folder's name (`claimed_name`);
+    the folder is claimed until `claims` closes.
 
     Raises:
-        ConfigError, InputError: something is wrong; no folder was made.
+        ConfigError, InputError: a setting or the scene is wrong; no folder was made.
     """
     folder = place_of(settings.resolved, stamp, settings.idle)
     files = read_run(folder)
@@ -217,7 +245,6 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: Ex
         lost = f", {', '.join(files.lost)} lost since" if files.lost else ""
         logger.info("finished earlier%s%s: %s", by_another(files), lost, folder)
         return None
-    at_hand = replace(settings, general=replace(settings.general, folder=str(folder), reuse=False))
     try:
         with ExitStack() as claim:
             if folder.is_dir():
@@ -226,35 +253,32 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: Ex
             claims.push(claim.pop_all())
     except CheckpointError as error:
         set_aside(folder, str(error))
-        return start(at_hand, plugins, claims)
-    logger.info("going on with %s at step %d", folder, run.step)
-    go_on(run, settings, plugins, changed=True)
+        general = replace(settings.general, folder=str(folder), reuse=False)
+        return start(replace(settings, general=general), plugins, claims)
+    logger.info("continuing %s at step %d", folder, run.step)
+    record_changes(run, settings, plugins, changed=True)
     write_config(folder / "config.yaml", settings.resolved)
     return run
 
 
 def continued(folder: Path, files: RunFiles, settings: Settings, stamp: str) -> Run:
-    """Returns the run of a folder that is named by its composition.
-
-    Raises:
-        CheckpointError: there is nothing in it to go on with.
-    """
+    """Return the run of a folder that is named by its composition; raise CheckpointError if it has no checkpoint."""
     if not checkpoint.sidecars(folder / "checkpoints"):
         raise CheckpointError(f"{folder} holds no checkpoint")
-    scene = trained_on(files) if files.environment else stamp  # the name of the folder tells it as well
+    scene = trained_on(files) if files.environment else stamp  # the folder's name depends on the stamp as well
     if composition_key(files.config, scene, settings.idle) != folder.name:
-        raise CheckpointError(f"{folder} was trained on by another composition than the one it is named by")
+        raise CheckpointError(f"{folder} holds the run of another composition than its name says")
     return restored(settings, folder, training=True)
 
 
 def by_another(files: RunFiles) -> str:
-    """Returns words for what another revision of the source has trained; none for what this one has."""
+    """Name another revision of the source that trained a run; empty for this one."""
     revision = other_revision(files, this := source_revision())
     return f" by another revision of gsx's source ({revision}, this is {this})" if revision else ""
 
 
 def set_aside(folder: Path, reason: str) -> None:
-    """Makes room for a run in a folder without a usable checkpoint; one with results is kept beside it."""
+    """Remove a folder without a usable checkpoint; rename it instead if it holds results."""
     if not folder.exists():
         return
     results = [folder / "evaluation.json", folder / "point_cloud.ply", *checkpoint.sidecars(folder / "checkpoints")]
@@ -264,9 +288,3 @@ def set_aside(folder: Path, reason: str) -> None:
     kept = next(p for n in range(1, 1000) if not (p := folder.parent / f".{folder.name}_set_aside_{n}").exists())
     folder.rename(kept)
     logger.warning("%s; kept as %s, training anew", reason, kept)
-
-
-def as_trained(run: Run) -> RasterSettings:
-    """Returns the rules of a run with path=auto as its training decided it, so that times are those of one path."""
-    path = read_run(run.folder).environment.get("rasterizer")
-    return replace(run.raster, path=path) if run.raster.path == "auto" and path == "compiled" else run.raster

@@ -1,6 +1,6 @@
-"""A closed camera path through what the training cameras show, and animations.
+"""A closed camera path within the range of the training cameras, and animations.
 
-The path lives in cylindrical coordinates about the point the cameras look at: bearing around the mean up direction,
+The path has cylindrical coordinates about the point that the cameras look at: bearing around the mean up direction,
 distance from that axis, height along it. Cameras that surround the point give a full circle; cameras on one side give
 a small ellipse of bearing and height; cameras that look outward give a turn on the spot they surround.
 """
@@ -26,24 +26,24 @@ from gsx.core.shapes import Float, UInt8
 from gsx.experiments.viewer.up_direction import upright
 
 PARALLEL = 0.01
-"""Viewing rays whose mean squared sine against one direction is below this (6 degrees) meet nowhere reliable."""
+"""Mean squared sine of viewing rays against one direction (6 degrees) below which they do not meet reliably."""
 OUTWARD = 0.01
-"""Cameras whose rays meet less than this fraction of the scene's depth in front of them look outward."""
+"""Share of the scene's depth: cameras whose rays meet nearer in front of them look outward."""
 SWING = 0.5
-"""An orbit on one side of the scene keeps to this fraction of the cameras' range: in its middle, views are dense."""
+"""Share of the cameras' range that an orbit on one side of the scene uses: in its middle, views are dense."""
 LEAST_SWING = math.radians(2)
-"""Smallest half-swing, so that something moves with a single camera."""
+"""Smallest half-swing, so that a single camera moves as well."""
 LARGEST_EDGE = 8192
-"""Frames larger than this in either direction are refused, px; each frame is written before the next is rendered."""
+"""Largest side of a frame, px."""
 SLOWEST, FASTEST = 0.1, 1000
 """Frames per second of an animation."""
 GIF_FASTEST = 50
-"""GIF delays are whole hundredths of a second, and viewers slow down below two of them."""
+"""Frames per second of a GIF: delays are whole hundredths of a second, and viewers slow down below two of them."""
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """How FFmpeg writes an animation."""
+    """Options of FFmpeg for an animation."""
 
     codec: str
     quality: dict[str, str]
@@ -68,7 +68,7 @@ class Orbit:
     """Rows: bearing 0, bearing 90 degrees, up; orthonormal, world coordinates."""
     radius: float
     height: float
-    """Above the target, scene units."""
+    """Height above the target, scene units."""
     bearing: float
     """Middle bearing, radians."""
     swing: float
@@ -76,14 +76,14 @@ class Orbit:
     rise: float
     """Half the range of heights, scene units."""
     outward: bool
-    """Look away from the axis."""
+    """True: look away from the axis."""
 
     def direction(self, bearing: float) -> Float[Tensor, "3"]:
-        """Returns the horizontal unit vector from the axis."""
+        """Return the horizontal unit vector from the axis."""
         return math.cos(bearing) * self.axes[0] + math.sin(bearing) * self.axes[1]
 
     def pose(self, phase: float) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        """Returns the eye and a point to look at."""
+        """Return the eye and a point to look at."""
         full = self.swing >= math.pi
         bearing = self.bearing + (phase if full else self.swing * math.cos(phase))
         height = self.height + self.rise * math.sin(phase)
@@ -93,19 +93,19 @@ class Orbit:
 
 
 def orbit_cameras(scene: Scene, frames: int) -> list[Camera]:
-    """Returns cameras on a closed orbit with the raster and field of view of the first training camera.
+    """Return cameras on a closed orbit with the raster and field of view of the first training camera.
 
     Raises:
         InputError: frames is below 2, or the cameras look straight along their own up direction.
     """
     if frames < 2:
-        raise InputError(f"an orbit of {frames} frames is none: ask for at least 2, for example --frames 60")
+        raise InputError(f"an orbit of {frames} frames does not move: give at least 2, for example --frames 60")
     path = fit_path([view.camera for view in scene.train], scene.points.positions, scene.extent)
     return [on_path(path, 2 * math.pi * frame / frames, scene.train[0].camera) for frame in range(frames)]
 
 
 def on_path(path: Orbit, phase: float, model: Camera) -> Camera:
-    """Returns the camera at a phase, with the intrinsics of `model` around the middle of its raster."""
+    """Return the camera at a phase, with the intrinsics of `model` around the middle of its raster."""
     eye, goal = path.pose(phase)
     fov_x = 2 * math.atan(model.width / (2 * model.fx))
     try:
@@ -124,7 +124,7 @@ def on_path(path: Orbit, phase: float, model: Camera) -> Camera:
 
 
 def fit_path(cameras: Sequence[Camera], points: Float[Tensor, "P 3"], extent: float) -> Orbit:
-    """Returns the path that suits the cameras; `points` give the depth where viewing rays do not meet."""
+    """Fit a path to the cameras; `points` give the depth if viewing rays do not meet."""
     centres = torch.stack([camera.centre for camera in cameras]).double()
     rotations = torch.stack([camera.rotation for camera in cameras]).double()
     forwards = rotations[:, 2]
@@ -155,7 +155,7 @@ def fit_path(cameras: Sequence[Camera], points: Float[Tensor, "P 3"], extent: fl
 def scene_depth(
     centres: Float[Tensor, "K 3"], forwards: Float[Tensor, "K 3"], points: Float[Tensor, "P 3"], extent: float
 ) -> float:
-    """Returns the median depth of the points in front of the mean camera, scene units."""
+    """Return the median depth of the points in front of the mean camera, scene units."""
     mean = forwards.mean(0)
     depths = (points - centres.mean(0)) @ mean / mean.norm().clamp_min(1e-9)
     front = depths[depths > 0]
@@ -165,7 +165,7 @@ def scene_depth(
 def nearest_to_rays(
     centres: Float[Tensor, "K 3"], forwards: Float[Tensor, "K 3"]
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
-    """Returns A, b of A x = b for the point x nearest to all viewing rays; A is singular where they are parallel."""
+    """Return A, b of A x = b for the point x nearest to all viewing rays; A is singular if they are parallel."""
     across = torch.eye(3, dtype=centres.dtype) - forwards[:, :, None] * forwards[:, None, :]
     return across.sum(0), (across @ centres[:, :, None]).sum(0)[:, 0]
 
@@ -173,9 +173,9 @@ def nearest_to_rays(
 def look_at_point(
     centres: Float[Tensor, "K 3"], forwards: Float[Tensor, "K 3"], depth: float
 ) -> tuple[Float[Tensor, "3"], bool]:
-    """Returns the point closest to all viewing rays, and whether it lies in front of the cameras.
+    """Return (point closest to all viewing rays, True if it lies in front of the cameras).
 
-    Nearly parallel rays meet nowhere: then the point at `depth` in front of the mean camera.
+    For nearly parallel rays: the point at `depth` in front of the mean camera.
     """
     system, right = nearest_to_rays(centres, forwards)
     if float(torch.linalg.eigvalsh(system / len(centres))[0]) < PARALLEL:
@@ -186,7 +186,7 @@ def look_at_point(
 
 
 def axes_about(up: Float[Tensor, "3"], hint: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Returns right-handed orthonormal rows with `up` last and the first as near to `hint` as can be."""
+    """Return right-handed orthonormal rows with `up` last and the first as near to `hint` as possible."""
     level = hint - (hint @ up) * up
     if level.norm() < 1e-3:
         level = torch.eye(3, dtype=up.dtype)[up.abs().argmin()]
@@ -196,7 +196,7 @@ def axes_about(up: Float[Tensor, "3"], hint: Float[Tensor, "3"]) -> Float[Tensor
 
 
 def arc(bearings: Sequence[float]) -> tuple[float, float]:
-    """Returns middle and half-width, radians, of the shortest arc with all bearings; half-width pi if they surround."""
+    """Return middle and half-width, radians, of the shortest arc with all bearings; half-width pi: all around."""
     ordered = sorted(bearings)
     following = [*ordered[1:], ordered[0] + 2 * math.pi]
     gap, start = max((b - a, b) for a, b in zip(ordered, following, strict=True))
@@ -210,18 +210,14 @@ def arc(bearings: Sequence[float]) -> tuple[float, float]:
 
 
 def write_animation(path: Path, frames: Iterable[Float[Tensor, "3 H W"]], fps: float) -> None:
-    """Writes frames, display values in [0, 1]: .gif anywhere; .webp and .mp4 with the extra `video`.
-
-    Frames are written one at a time; the file appears whole or not at all.
+    """Write frames, display values in [0, 1], one at a time: .gif; .webp and .mp4 need the extra `video`.
 
     Raises:
         InputError: the suffix, the speed or a frame size is unsuitable, there are no frames, or PyAV is missing.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise InputError(
-            f"'{path}' is no animation gsx can write: use {', '.join(SUFFIXES)}.{nearest(suffix, SUFFIXES)}"
-        )
+        raise InputError(f"'{path}' is not an animation: use {', '.join(SUFFIXES)}.{nearest(suffix, SUFFIXES)}")
     if suffix != GIF:
         import_av(path)  # before frames are rendered
     fastest = GIF_FASTEST if suffix == GIF else FASTEST
@@ -236,7 +232,7 @@ def write_animation(path: Path, frames: Iterable[Float[Tensor, "3 H W"]], fps: f
 
 
 def import_av(path: Path) -> Any:
-    """Returns PyAV, which brings FFmpeg's encoders."""
+    """Import PyAV, which brings FFmpeg's encoders."""
     try:
         import av
     except ImportError as error:
@@ -247,7 +243,7 @@ def import_av(path: Path) -> Any:
 
 
 def checked(path: Path, frames: Iterable[Float[Tensor, "3 H W"]]) -> Iterator[UInt8[Tensor, "H W 3"]]:
-    """Yields frames as bytes, each of the size of the first, none too large."""
+    """Yield frames as bytes; raise InputError if one is too large or of another size than the first."""
     size = None
     for frame in frames:
         width, height = frame.shape[2], frame.shape[1]
@@ -260,11 +256,11 @@ def checked(path: Path, frames: Iterable[Float[Tensor, "3 H W"]]) -> Iterator[UI
             raise InputError(f"{path}: frames of {width} x {height} px are too large: at most {LARGEST_EDGE} px a side")
         yield to_uint8(frame.detach().cpu()).permute(1, 2, 0).contiguous()
     if size is None:
-        raise InputError(f"{path}: there are no frames to write, ask for at least one")
+        raise InputError(f"{path}: there are no frames to write, give at least one")
 
 
 def write_gif(path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) -> None:
-    """Writes an endless GIF; the delay is rounded to hundredths of a second."""
+    """Write an endless GIF; the delay is rounded to hundredths of a second."""
     import OpenImageIO as oiio
 
     output = oiio.ImageOutput.create("gif")
@@ -285,7 +281,7 @@ def write_gif(path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) 
 
 
 def encode(encoding: Encoding, path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) -> None:
-    """Encodes frames with PyAV. An odd last row or column is dropped: 4:2:0 colour needs even sizes."""
+    """Encode frames with PyAV. An odd last row or column is dropped: 4:2:0 colour needs even sizes."""
     av = import_av(path)
     first = next(frames)
     height, width = (size // 2 * 2 for size in first.shape[:2])

@@ -1,4 +1,4 @@
-"""`gsx photographs RUN`: training photographs by how badly the model shows them, and what is wrong with them."""
+"""`gsx photographs RUN`: training photos by how far the render is from them, and what is wrong with them."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -22,34 +22,22 @@ from gsx.core.training.run import Run
 from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on
 from gsx.experiments.reports.pictures import Pictures, file_names, forget
 from gsx.experiments.reports.report import write_report
-from gsx.experiments.run_folder.claims import claimed
-from gsx.experiments.runs.open import as_trained, open_run, refuse_other, refuse_training
+from gsx.experiments.runs.open import reopened
 from gsx.experiments.runs.progress import Countdown
-from gsx.experiments.runs.rasterizer_path import warm
 from gsx.modules.corrections import Correction
 from gsx.modules.shifts import shift_of
 from gsx.scenes.photo_source import PhotoSource
 
 FOLDER = "photographs"
-"""Of the run's, with index.json and pictures of the worst."""
+"""Folder of a run with index.json and pictures of the worst photos."""
 
 
 def check_photos(folder: Path, plugins: Plugins, worst: int, overrides: Sequence[str] = ()) -> list[Finding]:
-    """Returns findings on all training photographs of a run, worst first.
+    """Return findings on all training photos of a run, worst first; errors as `reopened`.
 
-    The folder keeps them, with pictures of the `worst` ones, and the report shows them.
-
-
-    Raises:
-        ConfigError, InputError: an override is wrong, the folder is no run, or somebody trains in it.
-        CheckpointError: there is no usable checkpoint.
+    Writes them to FOLDER with pictures of the `worst` ones, and renews the report.
     """
-    refuse_other(folder)
-    refuse_training(folder, overrides)
-    with claimed(folder):
-        run, settings = open_run(folder, plugins, overrides)
-        run.raster = as_trained(run)
-        warm(run)
+    with reopened(folder, plugins, overrides) as (run, settings):
         findings = findings_of(run, settings.evaluation.tile_pixels)
         write_findings(run, findings, worst, settings.evaluation.tile_pixels)
         write_report(folder)
@@ -57,9 +45,9 @@ def check_photos(folder: Path, plugins: Plugins, worst: int, overrides: Sequence
 
 
 def findings_of(run: Run, pixels: int) -> list[Finding]:
-    """Returns findings on every training photograph, worst first."""
+    """Return findings on every training photo, worst first."""
     views = different(run.train_views)
-    progress, known = Countdown("looking at photographs", len(views)), sharpness_of(run.scene.train)
+    progress, known = Countdown("checking photos", len(views)), sharpness_of(run.scene.train)
     findings = []
     for view in views:
         findings.append(finding(run, view, known.get(view.name), pixels))
@@ -73,17 +61,17 @@ def findings_of(run: Run, pixels: int) -> list[Finding]:
 
 
 def is_active(module: TrainingModule | None) -> bool:
-    """Returns whether a module corrects photos now."""
+    """Return True for a module that corrects photos now."""
     return isinstance(module, Correction) and module.active
 
 
 def different(views: Sequence[View]) -> list[View]:
-    """Returns each view once: some protocols have the same one several times."""
+    """Return each view once: some protocols repeat views."""
     return list({view.name: view for view in views}.values())
 
 
 def sharpness_of(views: Sequence[View]) -> dict[str, float]:
-    """Returns sharpness against neighbours by the name of a view, of those that are photographs."""
+    """Return the sharpness of photos relative to their neighbours, by view."""
     files = {view.name: view.source.path for view in views if isinstance(view.source, PhotoSource)}
     ratios = sharpness(sorted(set(files.values())))
     return {name: ratios[path] for name, path in files.items() if path in ratios}
@@ -91,29 +79,29 @@ def sharpness_of(views: Sequence[View]) -> dict[str, float]:
 
 @torch.no_grad()
 def finding(run: Run, view: View, known_sharpness: float | None, pixels: int) -> Finding:
-    """Compares one photograph with the render; without remarks."""
-    own, photograph, counted = render(run, view.camera, pixels).image, view.image(), view.counted()
-    image = at_exposure(run, view, own)
-    error = black_out(image - photograph, counted).square().mean(0)
+    """Compare one photo with its render; without remarks."""
+    plain, photo, counted = render(run, view.camera, pixels).image, view.image(), view.counted()
+    image = as_photo(run, view, plain)
+    error = blacked(image - photo, counted).square().mean(0)
     return Finding(
         name=view.name,
-        psnr=psnr(image, photograph, counted),
-        gains=gains_of(own, photograph, counted),
-        shift=shift_of(image, photograph, counted),
+        psnr=psnr(image, photo, counted),
+        gains=gains_of(plain, photo, counted),
+        shift=shift_of(image, photo, counted),
         concentrated=concentrated(error, counted),
         sharpness=known_sharpness,
         masked=0.0 if counted is None else 1 - float(counted.float().mean()),
     )
 
 
-def at_exposure(run: Run, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """Returns a render at the exposure and with the movement of its photograph, on the CPU."""
+def as_photo(run: Run, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+    """Return a render with exposure and motion blur of its photo, on the CPU."""
     return run.as_photo(image, view).clamp(0, 1).cpu()
 
 
 @torch.no_grad()
 def write_findings(run: Run, findings: Sequence[Finding], worst: int, pixels: int) -> None:
-    """Writes index.json with all findings, and pictures of the worst."""
+    """Write index.json with all findings, and pictures of the worst."""
     place = Pictures(run.folder / FOLDER, run.step)
     place.folder.mkdir(parents=True, exist_ok=True)
     forget(place.folder)
@@ -121,17 +109,17 @@ def write_findings(run: Run, findings: Sequence[Finding], worst: int, pixels: in
     entries: list[dict[str, Any]] = [asdict(one) for one in findings]
     for entry, name in zip(entries, file_names([one.name for one in pictured]), strict=False):
         view = views[entry["name"]]
-        image = at_exposure(run, view, render(run, view.camera, pixels).image)
+        image = as_photo(run, view, render(run, view.camera, pixels).image)
         entry["files"] = place.compared(name, view, image)
         entry["size"] = list(view.camera.size)
     summary = {"step": run.step, "median_psnr": median(one.psnr for one in findings)}
     write_json(place.folder / "index.json", summary | {"views": entries})
 
 
-def lines(findings: Sequence[Finding], worst: int) -> list[str]:
-    """Returns lines for the terminal."""
+def summary_lines(findings: Sequence[Finding], worst: int) -> list[str]:
+    """Summarise findings for the log."""
     wrong = [one for one in findings if one.remarks]
     middle = median(one.psnr for one in findings)
-    out = [f"training photographs: {len(findings)}, median {middle:.2f} dB; standing out: {len(wrong)}"]
+    out = [f"training photos: {len(findings)}, median {middle:.2f} dB; with remarks: {len(wrong)}"]
     out += [f"{one.name}  {one.psnr:.2f} dB  {'; '.join(one.remarks)}" for one in wrong[:worst]]
     return out + ([f"and {len(wrong) - worst} more in {FOLDER}/index.json"] if len(wrong) > worst else [])

@@ -9,17 +9,17 @@ from gsx.core.rasterizer.compositor import Compositor
 
 
 class Compositors(Mapping[str, Compositor]):
-    """Compositors by name; each is made when it is first used."""
+    """Compositors by name, each built at its first use."""
 
     def __init__(self, components: Mapping[str, Component]) -> None:
         self.components = components
-        self.made: dict[str, Compositor] = {}
+        self.built: dict[str, Compositor] = {}
 
     def __getitem__(self, name: str) -> Compositor:
-        if name not in self.made:
+        if name not in self.built:
             component = self.components[name]
-            self.made[name] = component.factory(component.options())
-        return self.made[name]
+            self.built[name] = component.factory(component.options())
+        return self.built[name]
 
     def __contains__(self, name: object) -> bool:
         return name in self.components
@@ -32,11 +32,7 @@ class Compositors(Mapping[str, Compositor]):
 
 
 def with_compositors(options: RasterOptions, plugins: Plugins) -> RasterSettings:
-    """Returns settings whose path may name any registered compositor.
-
-    Raises:
-        ConfigError: the path names none.
-    """
+    """Return settings whose path may name any registered compositor; raise ConfigError if it names none."""
     try:
         return RasterSettings(**vars(options), compositors=Compositors(plugins.registry.of("compositor")))
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Progress for people and files: one live line on a terminal, plain lines elsewhere, metrics.jsonl."""
+"""Progress of training and evaluation: one live line on a terminal, plain lines elsewhere, metrics.jsonl."""
 
 import json
 import os
@@ -23,30 +23,29 @@ SMOOTHING = 0.3
 
 
 def clock(seconds: float) -> str:
-    """Returns seconds as m:ss, or h:mm:ss."""
-    whole = max(0, int(seconds))
-    hours, rest = divmod(whole, 3600)
+    """Format seconds as m:ss or h:mm:ss."""
+    hours, rest = divmod(max(0, int(seconds)), 3600)
     return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60}:{rest % 60:02d}"
 
 
 class Line:
-    """One line that is written over on a terminal; plain lines elsewhere, less often."""
+    """One line, overwritten on a terminal; plain lines elsewhere, less often."""
 
     def __init__(self) -> None:
         self.stream = sys.stderr
         self.live = self.stream.isatty()
-        self.shown = time.monotonic() - PLAIN_SECONDS
+        self.updated = time.monotonic() - PLAIN_SECONDS
         self.width = 0
 
     def due(self) -> bool:
-        """Returns whether it is time to show another; then the time counts from now on."""
+        """Return True if an update is due, and start its waiting time again."""
         now = time.monotonic()
-        due = now - self.shown >= (LIVE_SECONDS if self.live else PLAIN_SECONDS)
-        self.shown = now if due else self.shown
+        due = now - self.updated >= (LIVE_SECONDS if self.live else PLAIN_SECONDS)
+        self.updated = now if due else self.updated
         return due
 
     def show(self, text: str) -> None:
-        """Writes over the last line on a terminal, below it elsewhere."""
+        """Write over the last line on a terminal, below it elsewhere."""
         end, start = ("", "\r") if self.live else ("\n", "")
         text = text[: self.room()]
         with suppress(OSError):  # its terminal was closed
@@ -55,14 +54,14 @@ class Line:
         self.width = len(text)
 
     def room(self) -> int | None:
-        """Returns how many letters a terminal has for it: longer lines wrap and stay; None without a terminal."""
-        with suppress(OSError, ValueError):  # no terminal
+        """Return the columns of the terminal but one, as longer lines wrap; None without a terminal."""
+        with suppress(OSError, ValueError):
             columns = os.get_terminal_size(self.stream.fileno()).columns
             return columns - 1 if columns > 1 else None
         return None
 
     def end(self) -> None:
-        """Leaves the last line standing."""
+        """Leave the last line on the terminal."""
         if self.live and self.width:
             with suppress(OSError):
                 self.stream.write("\n")
@@ -70,14 +69,14 @@ class Line:
 
 
 class Countdown:
-    """A line with the share of a piece of work that is done, and the time left at the same speed."""
+    """A line with the finished share of some work, and the time left at the same speed."""
 
     def __init__(self, what: str, total: float) -> None:
         self.what, self.total, self.line = what, total, Line()
         self.done, self.started = 0.0, time.monotonic()
 
     def advance(self, amount: float, part: str) -> None:
-        """Adds to what is done of `total`; `part`: the last of it, in words."""
+        """Add to the finished amount of `total`; `part`: name of the last part."""
         self.done += amount
         left = max(0.0, self.total - self.done)
         last = left < 1e-6 * self.total
@@ -89,43 +88,43 @@ class Countdown:
 
 
 class Progress:
-    """Listener that shows step, speed, loss, PSNR, primitives, memory and time left."""
+    """Listener that displays step, speed, loss, PSNR, primitives, memory and time left."""
 
     def __init__(self) -> None:
         self.output = Line()
-        self.steps, self.shown = 0, 0.0
-        """Steps since the line was shown, and the seconds that had been trained for by then."""
+        self.steps, self.seconds = 0, 0.0
+        """Steps since the last update, and seconds of training at that update."""
         self.averages: dict[str, float] = {}
 
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
-        """Measures speed from here on."""
-        self.shown = run.progress.seconds
+        """Measure speed from here on."""
+        self.seconds = run.progress.seconds
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
-        """Shows the line when it is time."""
+        """Update the line when due."""
         self.steps += 1
         if not self.output.due() and not run.complete:
             return
         self.average("loss", float(step.loss))
         self.average("psnr", step.psnr())
-        self.average("speed", self.steps / max(run.progress.seconds - self.shown, 1e-9))
-        self.steps, self.shown = 0, run.progress.seconds
+        self.average("speed", self.steps / max(run.progress.seconds - self.seconds, 1e-9))
+        self.steps, self.seconds = 0, run.progress.seconds
         self.output.show(self.line(run))
 
     @hookimpl
     def gsx_training_finished(self, run: Run) -> None:
-        """Leaves the last line standing."""
+        """Leave the last line on the terminal."""
         self.output.end()
 
     def average(self, name: str, value: float) -> None:
-        """Averages what is displayed, exponentially."""
+        """Update the exponential average of a displayed value."""
         old = self.averages.get(name, value)
         self.averages[name] = old + SMOOTHING * (value - old)
 
     def line(self, run: Run) -> str:
-        """Returns the line."""
+        """Return the line."""
         a, primitives, memory = self.averages, len(run.backbone.table), peak_memory_mb(run.device)
         megabytes = "" if memory is None else f"  {memory:,.0f} MB"
         return (
@@ -136,7 +135,7 @@ class Progress:
 
 
 def read_curves(folder: Path) -> list[dict[str, Any]]:
-    """Returns the lines of a run's metrics.jsonl, without one that a crash cut off."""
+    """Read the intact lines of a run's metrics.jsonl."""
     return read_lines(folder / METRICS, {})
 
 
@@ -149,7 +148,7 @@ class MetricsLog:
 
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
-        """Opens the file; a resumed run drops lines later than its checkpoint."""
+        """Open the file without lines later than the run's step, which a resumed run may have."""
         path = run.folder / METRICS
         run.progress.curves[:] = [line for line in read_curves(run.folder) if line["step"] <= run.step]
         replace_file(path, "".join(json.dumps(line) + "\n" for line in run.progress.curves).encode())
@@ -157,7 +156,7 @@ class MetricsLog:
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
-        """Writes a line when due, or when something noteworthy happened."""
+        """Write a line when due, or after an event."""
         points = run.training.test_points
         tested = points > 0 and run.step * points // run.iterations > (run.step - 1) * points // run.iterations
         event = step.changes or step.pseudo or step.skipped
@@ -172,9 +171,9 @@ class MetricsLog:
         self.stream.flush()
 
     def entry(self, run: Run, step: StepResult) -> dict:
-        """Returns one line of metrics.jsonl."""
+        """Return one line of metrics.jsonl."""
         memory = peak_memory_mb(run.device)
-        line = {
+        return {
             "step": run.step,
             "seconds": round(run.progress.seconds, 3),
             "loss": float(step.loss),
@@ -186,15 +185,15 @@ class MetricsLog:
             **({"pseudo": step.pseudo} if step.pseudo else {}),
             **({"left_out": step.dropped} if step.dropped else {}),
             **step.changes,
+            **({"skipped": step.skipped} if step.skipped else {}),
         }
-        return line | ({"skipped": step.skipped} if step.skipped else {})
 
     @hookimpl
     def gsx_training_finished(self, run: Run) -> None:
-        """Closes the file."""
+        """Close the file."""
         self.close()
 
     def close(self) -> None:
-        """Closes the file, however training ended."""
+        """Close the file, however training ended."""
         if self.stream is not None:
             self.stream.close()

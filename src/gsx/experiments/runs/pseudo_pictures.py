@@ -1,4 +1,4 @@
-"""Pictures of pseudo views for people: what was redrawn, the result, and what the model shows there after training."""
+"""Pictures of pseudo views for the report: before and after redrawing, and as the trained model renders them."""
 
 import logging
 from pathlib import Path
@@ -14,12 +14,12 @@ from gsx.experiments.evaluation.eval_options import EvalOptions
 
 logger = logging.getLogger(__name__)
 
-SHOWN = 6
-"""Pseudo views of each augmenter that are shown."""
+MOST_VIEWS = 6
+"""Pseudo views of each augmenter in the report."""
 
 
 def write_pseudo_pictures(run: Run, options: EvalOptions) -> None:
-    """Renders pseudo views of the last events from the trained model, beside what augmenters left to be looked at."""
+    """Render pseudo views of the last events that have pictures by augmenters, and write their index."""
     folder = run.folder / "pseudo"
     entries: list[dict[str, Any]] = []
     latest = {path.stem.rpartition("_")[0]: path for path in sorted(folder.glob("*.safetensors"))}
@@ -27,24 +27,23 @@ def write_pseudo_pictures(run: Run, options: EvalOptions) -> None:
         try:
             views, _ = load_views(path)
         except (OSError, ValueError) as error:
-            logger.warning("%s cannot be read (%s): its pseudo views are not shown", path, error)
+            logger.warning("%s cannot be read (%s): the report omits its pseudo views", path, error)
             continue
-        entries += [
-            picture_entry(run, options, augmenter, view) for view in with_pictures(folder, augmenter, views)[:SHOWN]
-        ]
+        pictured = with_pictures(folder, augmenter, views)[:MOST_VIEWS]
+        entries += [picture_entry(run, options, augmenter, view) for view in pictured]
     if entries:
         write_json(folder / "index.json", {"views": entries})
 
 
 def with_pictures(folder: Path, augmenter: str, views: list[PseudoView]) -> list[PseudoView]:
-    """Returns one view for each picture that there is."""
+    """Return one view for each existing picture."""
     complete = [view for view in views if {"event", "scale", "kind"} <= view.provenance.keys()]
     by_name = {picture_name(augmenter, view): view for view in complete}
     return [view for name, view in by_name.items() if (folder / name).is_file()]
 
 
 def picture_entry(run: Run, options: EvalOptions, augmenter: str, view: PseudoView) -> dict[str, Any]:
-    """Renders one of them; returns its entry in the index."""
+    """Render one pseudo view; return its entry in the index."""
     after = render(run, view.camera, options.tile_pixels).image
     made = picture_name(augmenter, view)
     name = made.replace(".png", "_after.png")

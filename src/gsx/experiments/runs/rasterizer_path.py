@@ -1,4 +1,4 @@
-"""Which path of the rasterizer a training run takes, and compiling for it before the first step."""
+"""Rasterizer path of a training run, and compiling it before the first step."""
 
 import logging
 from collections.abc import Callable
@@ -20,7 +20,7 @@ logger = logging.getLogger(__name__)
 
 
 def decide(settings: RasterSettings, steps: int, device: torch.device) -> RasterSettings:
-    """Replaces path=auto for a training run of `steps` by eager or compiled, and logs the reason."""
+    """Replace path=auto for a training run of `steps` by eager or compiled, and log the reason."""
     if settings.path != "auto":
         compositor = settings.compositors.get(settings.compositor_name)
         if isinstance(compositor, Restricted):
@@ -30,12 +30,12 @@ def decide(settings: RasterSettings, steps: int, device: torch.device) -> Raster
     compiled = long_enough and available(device.type)
     reason = f"{steps} steps" if compiled or not long_enough else "no working compiler"
     path = "compiled" if compiled else "eager"
-    logger.info("rasterizer: %s path (%s; rasterizer=eager or rasterizer=compiled decides otherwise)", path, reason)
+    logger.info("rasterizer: %s path (%s; set rasterizer=eager or rasterizer=compiled to choose)", path, reason)
     return replace(settings, path=path)
 
 
 def warm(run: Run, helped: bool = True) -> None:
-    """Compiles rasterizer and loss before the first step, and logs the time; `helped`: by a second process."""
+    """Compile rasterizer and loss before the first step, and log the time; `helped`: by a second process."""
     if not run.raster.backend.on(run.device.type).compiled:
         return
     logger.info("compiling the rasterizer once; later runs find it on disk ...")
@@ -50,10 +50,7 @@ def warm(run: Run, helped: bool = True) -> None:
 def compile_in_background(
     settings: RasterSettings, device: torch.device, take: Callable[[RasterSettings], None]
 ) -> Thread:
-    """Compiles what draws pictures in a thread, then hands over settings that use it; until then the eager path draws.
-
-    Nothing is handed over where nothing compiles.
-    """
+    """Compile rendering in a thread, then call `take` with settings that use it, unless compiling fails."""
     compiled = replace(settings, path="compiled")
 
     def draw_one() -> None:
@@ -62,8 +59,8 @@ def compile_in_background(
             if not available(device.type):
                 return
             rasterize_tiled(splats, warm_camera(), compiled, background=torch.zeros(3, device=device))
-        except Exception as error:  # a compiler's; pictures come all the same
-            logger.info("pictures are drawn by the eager path (%s)", first_line(error))
+        except Exception as error:  # of a compiler; the eager path still renders
+            logger.info("rendering with the eager path (%s)", first_line(error))
         else:
             take(compiled)
 

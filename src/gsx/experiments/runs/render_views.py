@@ -27,26 +27,22 @@ from gsx.scenes.origin import moved
 
 logger = logging.getLogger(__name__)
 
+FRAMES = "frame_[0-9][0-9][0-9][0-9][0-9].png"
+"""Pictures of a path."""
+Draw = Callable[[Camera], Float[Tensor, "3 H W"]]
+
 
 def view_named(run: Run, name: str) -> View:
-    """Returns a training or test view by name.
-
-    Raises:
-        InputError: there is none; the nearest name is given.
-    """
+    """Return a training or test view by name; raise InputError with the nearest name if there is none."""
     views = {view.name: view for view in [*run.scene.test, *run.train_views]}
     if name not in views:
         known = nearest(name, list(views)) or f" The first are {', '.join(list(views)[:3])}."
-        raise InputError(f"'{name}' is no view of scene '{run.scene.name}'.{known}")
+        raise InputError(f"Unknown view '{name}' of scene '{run.scene.name}'.{known}")
     return views[name]
 
 
 def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -> None:
-    """Writes every test view at `zoom` times the training resolution as PNG.
-
-    Raises:
-        InputError: no view is held out.
-    """
+    """Write every test view at `zoom` times the training resolution as PNG; raise InputError if none is held out."""
     if not run.scene.test:
         raise InputError(
             f"{run.folder} has no test views, all are trained on (scene.split=none): give --orbit FILE, or "
@@ -61,45 +57,40 @@ def render_test_views(run: Run, settings: Settings, folder: Path, zoom: float) -
 
 
 def render_orbit(run: Run, settings: Settings, path: Path, frames: int, fps: float, zoom: float) -> None:
-    """Animates a closed path around the scene."""
+    """Animate a closed path around the scene."""
     remove_partial(path.parent, below=False)
     pixels = settings.evaluation.tile_pixels
     cameras = (camera.zoom(zoom) for camera in orbit_cameras(run.scene, frames))
     write_animation(path, (render(run, camera, pixels).image for camera in cameras), fps)
 
 
-FRAMES = "frame_[0-9][0-9][0-9][0-9][0-9].png"
-"""Pictures of a path."""
-Draw = Callable[[Camera], Float[Tensor, "3 H W"]]
-
-
 def run_pictures(run: Run, settings: Settings) -> Draw:
-    """Returns a function that draws a run for any camera in the coordinates of the scene's files."""
+    """Return a function that renders a run for any camera in the coordinates of the scene's files."""
     pixels, origin = settings.evaluation.tile_pixels, run.scene.origin
     return lambda camera: render(run, moved(camera, origin), pixels).image
 
 
 def file_pictures(path: Path, cameras: Sequence[Camera] = (), axes: str = AUTO) -> Draw:
-    """Returns what draws the splats of a file over black, for any camera in its coordinates. cameras: some of those;
-    axes: the file's.
+    """Return a function that renders a splat file over black for any camera in its coordinates; `axes`: of the file.
 
     Raises:
-        InputError: it cannot be read, or no splat is in view of any of the cameras.
+        InputError: it cannot be read, or no splat is in view of any of `cameras`.
     """
     watch_cores()
     (gaussians, origin), raster = read_around(path, axes), rules_of(path)
     if cameras:
-        refuse_nothing_in_view(
-            gaussians, [moved(camera, origin) for camera in cameras], "camera of the path", path, origin
-        )
+        around = [moved(camera, origin) for camera in cameras]
+        refuse_nothing_in_view(gaussians, around, "camera of the path", path, origin)
     return lambda camera: render_gaussians(gaussians, moved(camera, origin), raster, torch.zeros(3))
 
 
 def render_path(
     way: CameraPath, draw: Draw, to: Path, movie: bool, zoom: float, run_folder: Path | None = None
 ) -> Path:
-    """Writes the frames of a camera path: an animation, or a folder of numbered PNGs; returns which. run_folder: of the
-    run that is drawn."""
+    """Write the frames of a camera path as an animation or numbered PNGs in a folder; return that.
+
+    run_folder: of the rendered run.
+    """
     cameras = way.cameras(zoom)
     if movie:
         remove_partial(to.parent, below=False)
@@ -110,18 +101,16 @@ def render_path(
     names = [f"frame_{number:05d}.png" for number in range(len(cameras))]
     for name, camera in zip(names, cameras, strict=True):
         write_image(to / name, draw(camera))
-    others = without_others(to, FRAMES, names, run_folder)
-    if others:
+    if others := without_others(to, FRAMES, names, run_folder):
         logger.warning(
-            "%s also holds %d frames from %s on, of a longer path: remove them before you make a film of it",
+            "%s also holds %d frames of a longer path, from %s on: remove them before you make a film",
             *(to, len(others), others[0].name),
         )
     return to
 
 
 def without_others(folder: Path, pattern: str, names: Sequence[str], run_folder: Path | None) -> list[Path]:
-    """Removes pictures that were in a folder before, of other views or of a longer path, from one of a run's renders;
-    returns those that are left anywhere else."""
+    """Remove other pictures from a folder of a run's renders; return those that are left in any other folder."""
     others = sorted(set(folder.glob(pattern)) - {folder / name for name in names})
     if run_folder is None or folder.resolve().parent != run_folder.resolve() / "renders":
         return others

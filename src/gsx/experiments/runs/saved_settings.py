@@ -18,17 +18,17 @@ from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.run_folder.files import part
 from gsx.experiments.run_folder.general_options import GeneralOptions
 from gsx.experiments.run_folder.renamed import renamed
-from gsx.experiments.runs.settings import COMPONENT_KINDS, Settings, settings_from, strict_node
-from gsx.experiments.runs.typed import dotted, right_key, schema_keys, texts
+from gsx.experiments.runs.settings import COMPONENT_KINDS, SEVERAL, Settings, settings_from, strict_node
+from gsx.experiments.runs.typed import dotted, schema_keys, texts, unknown_key
 
 
 def write_config(path: Path, resolved: dict[str, Any]) -> None:
-    """Saves a resolved configuration as YAML."""
+    """Save a resolved configuration as YAML."""
     replace_text(path, OmegaConf.to_yaml(OmegaConf.create(resolved)))
 
 
 def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> Settings:
-    """Returns the settings of a run, with `key=value` overrides of its keys and of those that gsx has had since.
+    """Return the settings of a run, with `key=value` overrides of its keys and of keys that gsx has added since.
 
     Raises:
         ConfigError: the file is unreadable, or an override names no such key.
@@ -37,11 +37,10 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals:
-            raise ConfigError(f"'{override}' is given no value: write {override}=VALUE")
+            raise ConfigError(f"'{override}' has no value: write {override}=VALUE")
         known = list(dict.fromkeys([*dotted(OmegaConf.to_container(config)), *newer_keys(config, plugins)]))
         if key not in known:
-            near = right_key(key, known) or " All of them are in that file."
-            raise ConfigError(f"'{key}' is no key of {path}.{near}")
+            raise ConfigError(unknown_key(key, known, f" for {path}", " That file lists all keys."))
         try:
             OmegaConf.update(config, key, value_of(value), force_add=True)
         except Exception as error:  # the YAML parser has its own family of errors
@@ -50,11 +49,11 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
 
 
 def saved_config(path: Path) -> DictConfig:
-    """Reads a configuration by today's names.
+    """Read a configuration by today's names.
 
     Raises:
-        ConfigError: it cannot be read, or looks something up: gsx writes plain values, and somebody else's file would
-            learn of this machine's environment.
+        ConfigError: it cannot be read, or has interpolations: gsx writes plain values, and a foreign file could read
+            this machine's environment.
     """
     try:
         content = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
@@ -62,19 +61,19 @@ def saved_config(path: Path) -> DictConfig:
         raise ConfigError(f"{path} cannot be read ({first_line(error)}): give the folder of a gsx run") from error
     for key, text in texts(content):
         if "${" in text:
-            raise ConfigError(f"{path}: {key} is '{text}'; a run's configuration holds plain values: write what it is")
+            raise ConfigError(f"{path}: {key} is '{text}'; a run's configuration holds plain values: write its value")
     if not isinstance(content, dict):
         raise ConfigError(f"{path} holds no configuration: give the folder of a gsx run")
     return OmegaConf.create(renamed(content))  # type: ignore[arg-type]
 
 
 def newer_keys(config: DictConfig, plugins: Plugins) -> Iterator[str]:
-    """Yields dotted keys that a run's composition may have by today's schemas; an older run's file lacks some."""
+    """Yield the dotted keys of today's schemas for a run's composition; an older run's file lacks some."""
     values: Any = OmegaConf.to_container(config)
     schemas: dict[str, type] = {"training": TrainingOptions, "eval": EvalOptions, "metrics.lpips": LpipsOptions}
     schemas |= {f"training.{name}": one.options for name, one in plugins.registry.of("module").items()}
     nodes = {kind: (kind, part(values, kind)) for kind in COMPONENT_KINDS}
-    for kind in ("augmenter", "regenerator", "tracker"):
+    for kind in SEVERAL:
         nodes |= {f"{kind}.{name}": (kind, node) for name, node in part(values, kind).items() if isinstance(node, dict)}
     schemas |= {
         key: plugins.registry.find(kind, str(node.get("name", ""))).options for key, (kind, node) in nodes.items()
@@ -85,15 +84,15 @@ def newer_keys(config: DictConfig, plugins: Plugins) -> Iterator[str]:
 
 
 def value_of(word: str) -> Any:
-    """Returns what a word of the command line stands for, as YAML."""
+    """Parse a word of the command line as YAML."""
     return OmegaConf.select(OmegaConf.create(f"value: {word}"), "value")
 
 
 def with_newer_settings(config: DictConfig) -> DictConfig:
-    """Adds what older runs trained by without a key for it.
+    """Add the values by which older runs trained without a key for them.
 
-    These are defaults of the rasterizer, any number of absent images, strict checks of redrawn pictures; the gate of
-    `clone_split`, which anchors do not have, goes.
+    These are defaults of the rasterizer, any number of absent images, and strict checks of redrawn pictures. The gate
+    of `clone_split` is removed for anchors, which do not have it.
     """
     if isinstance(config.get("rasterizer"), DictConfig):
         options = {key: v for key, v in dataclasses.asdict(RasterOptions()).items() if key not in OF_BACKBONES}

@@ -1,4 +1,4 @@
-"""Runs that begin with somebody's splat file (`init=FILE`) instead of a scene's points."""
+"""Runs that start from a splat file (`init=FILE`) instead of a scene's points."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -28,44 +28,41 @@ from gsx.scenes.points import GREY
 logger = logging.getLogger(__name__)
 
 OWN_KEYS = ("backbone", "augmenter", "init", "iterations", "variant", "preset", "budget", "experiment")
-"""What `gsx eval FILE` sets, or what trains: nothing of it can be overridden."""
+"""Keys that `gsx eval FILE` sets or that only training uses: they cannot be overridden."""
 BLENDS = (
-    "its colours are of linear light and were made sRGB, in which splats are blended here: figures differ from those "
-    "of programs that blend in linear light"
+    "its colours were converted from linear light to sRGB, in which gsx blends: figures differ from those of programs "
+    "that blend in linear light"
 )
-"""Remark of evaluations on such files."""
+"""Remark of evaluations on files with linear colours."""
 MIP_KERNEL = 0.1
-"""px^2 by which models of Mip-Splatting are dilated, with opacities compensated (Yu et al. 2024)."""
+"""Screen dilation of Mip-Splatting with compensated opacities, px^2 (Yu et al. 2024)."""
 
 
 def starting_splats(settings: Settings) -> SplatContent | None:
-    """Returns what the splat file holds that a run begins with, means in float64; None: it begins with points.
+    """Read the splat file of `init`, means in float64; None: the run starts from points.
 
     Raises:
         ConfigError: axes are set without a file.
-        InputError: the file cannot be read, or holds nothing.
+        InputError: the file cannot be read or is empty.
     """
     path, axes = splat_file(settings.general.init), settings.general.axes
     if path is None and axes != AUTO:
-        raise ConfigError(f"axes={axes} is about a splat file: give init=FILE, or leave it out")
+        raise ConfigError(f"axes={axes} needs a splat file: give init=FILE, or leave axes out")
     if path is None:
         return None
     content = read_splats(path, axes)
     if not len(content.gaussians.means):
         raise InputError(f"init: {path} holds no splats: choose another file")
-    logger.info("beginning with the %d splats of %s", len(content.gaussians.means), path)
+    logger.info("starting from the %d splats of %s", len(content.gaussians.means), path)
     return content
 
 
 def in_scene(gaussians: Gaussians, scene: Scene) -> Gaussians:
-    """Returns Gaussians of a file relative to the scene's origin.
-
-    A file that lies around (0, 0, 0), as other programs leave it, is taken as written around that origin.
-    """
+    """Return Gaussians of a file relative to the scene's origin; other programs may have subtracted it already."""
     origin = origin_of_file(gaussians, scene)
     if origin != scene.origin:
         logger.warning(
-            "init: the splats lie around (0, 0, 0), and the scene around %s: taken for coordinates relative to that",
+            "init: the splats lie around (0, 0, 0), the scene around %s: reading positions relative to that",
             in_words(scene.origin),
         )
     elif any(origin) and stored_in_single(gaussians.means):
@@ -75,23 +72,19 @@ def in_scene(gaussians: Gaussians, scene: Scene) -> Gaussians:
 
 
 def origin_of_file(gaussians: Gaussians, scene: Scene) -> Origin:
-    """Returns what to subtract from the positions of a file: the scene's origin, unless that was done before."""
+    """Return the offset to subtract from a file's positions: the scene's origin, or 0 if it was subtracted before."""
     lies_there = any(scene.origin) and lies_around_zero(gaussians.means, scene.origin)
     return NO_ORIGIN if lies_there else scene.origin
 
 
 def lies_around_zero(positions: Float[Tensor, "P 3"], origin: Origin) -> bool:
-    """Returns whether most positions are nearer to (0, 0, 0) than to an origin."""
+    """Return True if most positions are nearer to (0, 0, 0) than to an origin."""
     offsets = positions - torch.tensor(origin, dtype=torch.float64)
     return float((positions.norm(dim=1) < offsets.norm(dim=1)).double().mean()) > 0.5
 
 
 def start_doubts(settings: Settings, scene: Scene, start: Gaussians | None) -> list[str]:
-    """Returns why the splat file that a run begins with may not belong to its scene; see `doubts_about`.
-
-    Raises:
-        InputError: no splat is in view.
-    """
+    """Return doubts that the start file belongs to its scene; raise InputError if no splat is in view."""
     path = splat_file(settings.general.init)
     if start is None or path is None:
         return []
@@ -99,20 +92,20 @@ def start_doubts(settings: Settings, scene: Scene, start: Gaussians | None) -> l
     return [*doubts, f"{path.name}: {BLENDS}"] if is_linear(path) else doubts
 
 
-def start_from(backbone: Backbone[Any], gaussians: Gaussians, name: str) -> None:
-    """Gives Gaussians to a backbone in place of what it was built with.
+def go_on_from(backbone: Backbone[Any], gaussians: Gaussians, name: str) -> None:
+    """Replace a backbone's primitives by Gaussians.
 
     Raises:
-        ConfigError: it cannot go on from any.
-        InputError: not from these.
+        ConfigError: the backbone cannot start from Gaussians.
+        InputError: it cannot start from these.
     """
     if not isinstance(backbone, FromGaussians):
-        raise ConfigError(f"backbone={name} cannot begin with a splat file: choose backbone=gs3d, or leave out init")
-    backbone.start_from(gaussians)
+        raise ConfigError(f"backbone={name} cannot start from a splat file: choose backbone=gs3d, or leave out init")
+    backbone.go_on_from(gaussians)
 
 
 def in_front_of(camera: Camera) -> Gaussians:
-    """Returns one splat on the camera's axis: it stands in until a checkpoint is read."""
+    """Return one splat on the camera's axis as a placeholder until a checkpoint is read."""
     ahead = camera.centre + camera.rotation[2].to(camera.centre)
     return Gaussians(
         means=ahead[None].float(),
@@ -125,60 +118,56 @@ def in_front_of(camera: Camera) -> Gaussians:
 
 
 def one_point(gaussians: Gaussians) -> PointCloud:
-    """Returns the first Gaussian as a point: a backbone is built from points, and gets the splats afterwards."""
+    """Return the first Gaussian as a point: a backbone is built from points before its splats are replaced."""
     return PointCloud(positions=gaussians.means[:1], colours=torch.full((1, 3), 128, dtype=torch.uint8))
 
 
 def rules_of(path: Path) -> RasterSettings:
-    """Returns the rules that a splat file states for its drawing.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """Return the rasterizer settings that a splat file states."""
     return RasterSettings(dilation=MIP_KERNEL, compensate=True) if compensated(path) else RasterSettings()
 
 
 def composition_of(path: Path, overrides: Sequence[str]) -> list[str]:
-    """Returns words of the command line that evaluate a splat file on a scene, drawn as it is.
+    """Return the overrides that evaluate a splat file on a scene.
 
     Raises:
-        ConfigError: an override is about what the file is not, or no scene is given.
+        ConfigError: an override is for training, or there is no scene.
     """
     for word in overrides:
         if key_of(word) in OWN_KEYS:
             raise ConfigError(f"gsx eval {path} draws the file as it is: leave out '{word}', or train with init={path}")
     if not any(word.startswith(("scene=", "dataset=")) for word in overrides):
-        raise ConfigError(f"{path} needs the photographs to compare with: give scene=... scene.path=FOLDER")
+        raise ConfigError(f"{path} needs photos to compare with: give scene=... scene.path=FOLDER")
     if not path.is_file():
         raise InputError(f"'{path}' does not exist: give a run folder or a splat file")
     words = ["backbone=gs3d", f"init={quoted(str(path))}", "iterations=0"]
     filters = ("rasterizer.dilation=", "rasterizer.compensate=")
     if compensated(path) and not any(word.lstrip("+").startswith(filters) for word in overrides):
         words += [f"rasterizer.dilation={MIP_KERNEL}", "rasterizer.compensate=true"]
-        logger.info("%s says that its opacities are compensated: drawn with %s", path, " ".join(words[3:]))
+        logger.info("%s states compensated opacities: rendering with %s", path, " ".join(words[3:]))
     return [*words, *overrides]
 
 
 # -- does a file belong to a scene? ------------------------------------------------------------------------------------
 
 MOST_SPLATS, MOST_POINTS, MOST_VIEWS = 50_000, 1000, 50
-"""Evenly spread ones that are looked at where there are more."""
+"""Numbers to compare, evenly spread over all."""
 LEAST_IN_VIEW = 0.05
-"""Share of splats in view of some camera below which they are doubted: splats of a scene have most of theirs (fox: 97 %
-in two test views), in other axes 0.2 % were left."""
+"""Share of splats in view of some camera below which they are doubted (fox: 97 % in two test views; in other axes
+0.2 %)."""
 LEAST_POINTS = 10
-"""Points of a scene that say something about where it is."""
+"""Points of a scene that are enough to locate it."""
 FAR = 0.25
-"""Median distance of points from the nearest splat, in sizes of the point cloud, above which splats are doubted: splats
-of a scene have 0.01 (fox), a tenth off its scale 0.11, in other axes or scales 0.7 and more."""
+"""Median distance of points from the nearest splat, in sizes of the point cloud, above which splats are doubted (fox:
+0.01; a tenth off its scale 0.11; in other axes or scales 0.7 and more)."""
 SIGMAS = 3.0
 """Standard deviations up to which a splat is drawn."""
 
 
 def doubts_about(gaussians: Gaussians, scene: Scene, path: Path, trains: bool) -> list[str]:
-    """Returns sentences on why a splat file may not belong to a scene, which also go to the log.
+    """Return and log doubts that a splat file belongs to a scene.
 
-    trains: the file is trained on, so that all views count; otherwise test views do, where there are any.
+    trains: compare with all views, because the file is trained on; otherwise with test views if there are any.
 
     Raises:
         InputError: no splat is in view of any of these views.
@@ -197,8 +186,7 @@ def doubts_about(gaussians: Gaussians, scene: Scene, path: Path, trains: bool) -
 def refuse_nothing_in_view(
     gaussians: Gaussians, cameras: Sequence[Camera], kind: str, path: Path, origin: Origin = NO_ORIGIN
 ) -> None:
-    """Raises InputError if no splat reaches the picture of any camera. kind: of the cameras, in words; origin: added to
-    coordinates in words."""
+    """Raise InputError if no splat reaches the picture of any camera; `kind`: name of the cameras."""
     if any(bool(reaching(gaussians, camera, SIGMAS).any()) for camera in cameras):
         return
     centres = torch.stack([camera.centre.double() for camera in cameras])
@@ -210,7 +198,7 @@ def refuse_nothing_in_view(
 
 
 def reaching(gaussians: Gaussians, camera: Camera, sigmas: float) -> Bool[Tensor, "N"]:
-    """Returns which splats are in front of a camera and at most so many of their deviations outside its picture."""
+    """Return which splats are in front of a camera and at most so many deviations outside its picture."""
     x, y, z = camera.to_camera(gaussians.means).unbind(1)
     radius = sigmas * camera.focal * gaussians.log_scales.double().amax(1).exp() / z.clamp_min(1e-12)
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
@@ -219,7 +207,7 @@ def reaching(gaussians: Gaussians, camera: Camera, sigmas: float) -> Bool[Tensor
 
 
 def in_view_doubts(gaussians: Gaussians, cameras: Sequence[Camera], kind: str) -> Iterator[str]:
-    """Yields a sentence if hardly any splat has its middle in view of some camera."""
+    """Yield a doubt if hardly any splat has its mean in view of some camera."""
     some = Gaussians(**{name: spread(value, MOST_SPLATS) for name, value in vars(gaussians).items()})
     in_view = torch.zeros(len(some.means), dtype=torch.bool, device=some.means.device)
     for camera in cameras[:: max(1, -(-len(cameras) // MOST_VIEWS))]:
@@ -227,13 +215,13 @@ def in_view_doubts(gaussians: Gaussians, cameras: Sequence[Camera], kind: str) -
     share = float(in_view.double().mean())
     if share < LEAST_IN_VIEW:
         yield (
-            f"only {share:.2%} of its splats are in view of any {kind}, it may be in other coordinates: compare its "
-            "pictures with the photos"
+            f"only {share:.2%} of the splats are in view of any {kind}, the file may be in other coordinates: compare "
+            "its renders with the photos"
         )
 
 
 def distance_doubts(gaussians: Gaussians, points: PointCloud) -> Iterator[str]:
-    """Yields a sentence if the scene's points are far from all splats; random points, which are grey, say nothing."""
+    """Yield a doubt if the scene's points are far from all splats; random points, which are grey, do not count."""
     places = evident_points(points)
     if not len(places):
         return
@@ -241,28 +229,28 @@ def distance_doubts(gaussians: Gaussians, points: PointCloud) -> Iterator[str]:
     distance = distance_from_points(spread(gaussians.means, MOST_SPLATS).cpu(), places)
     if size > 0 and distance > FAR * size:
         yield (
-            f"half of the scene's points are more than {distance:.3g} from its nearest splat, and the points have a "
-            f"size of {size:.3g}: it holds a part of the scene, or is in other coordinates"
+            f"half of the scene's points are more than {distance:.3g} from the nearest splat, in a point cloud of size "
+            f"{size:.3g}: the file holds a part of the scene, or is in other coordinates"
         )
 
 
 def evident_points(points: PointCloud) -> Float[Tensor, "n 3"]:
-    """Returns some of the points that were measured, float64; none of scenes that have few, as random ones are grey."""
+    """Return some of the measured points (random ones are grey), float64; none if there are few."""
     measured = points.positions[(points.colours != GREY).any(1)]
     return spread(measured, MOST_POINTS).double() if len(measured) >= LEAST_POINTS else measured[:0].double()
 
 
 def distance_from_points(means: Float[Tensor, "N 3"], places: Float[Tensor, "n 3"]) -> float:
-    """Returns the median distance of a scene's points from the nearest of some means, scene units."""
+    """Return the median distance of a scene's points from the nearest of some means, scene units."""
     return float(torch.cat([torch.cdist(part, means.double()).amin(1) for part in places.split(100)]).median())
 
 
 def middle(places: Float[Tensor, "N 3"], origin: Origin) -> str:
-    """Returns the median of places that count from an origin, in words."""
+    """Format the median of places relative to an origin."""
     values = [value + by for value, by in zip(places.double().median(0).values.tolist(), origin, strict=True)]
     return "({:.8g}, {:.8g}, {:.8g})".format(*values)
 
 
 def spread(rows: Float[Tensor, "N ..."], most: int) -> Float[Tensor, "n ..."]:
-    """Returns every so many rows, at most so many of them."""
+    """Return at most so many rows, evenly spread."""
     return rows[:: max(1, -(-len(rows) // most))]

@@ -1,4 +1,4 @@
-"""Plain values against typed schemas: dataclasses of options. Mistakes get the nearest match. No Hydra here."""
+"""Plain values checked against dataclasses of options; errors name the nearest match. No Hydra here."""
 
 import copy
 import dataclasses
@@ -18,14 +18,14 @@ from gsx.experiments.run_folder.renamed import advice
 
 @dataclasses.dataclass(frozen=True)
 class Values:
-    """Plain values; equal where they are written alike, so that 1 is neither 1.0 nor true."""
+    """Plain values, compared by their text: 1, 1.0 and true differ."""
 
     plain: Any = dataclasses.field(compare=False)
     text: str
 
 
 def typed(schema: type, values: Any, path: str) -> Any:
-    """Returns an instance of a dataclass from the plain values at a dotted key.
+    """Return an instance of a dataclass from the plain values at a dotted key.
 
     Raises:
         ConfigError: an unknown key or a value of the wrong type; value, key and remedy are named.
@@ -34,9 +34,9 @@ def typed(schema: type, values: Any, path: str) -> Any:
 
 
 @lru_cache(maxsize=512)
-def checked(schema: type, given: Values, path: str) -> Any:
-    """Does the same once: most nodes of many compositions are equal."""
-    values = given.plain
+def checked(schema: type, content: Values, path: str) -> Any:
+    """Return the same, cached: most nodes of many compositions are equal."""
+    values = content.plain
     refuse_not_finite(values, path)
     try:
         named = values if isinstance(values, dict) else {}
@@ -52,7 +52,7 @@ def checked(schema: type, given: Values, path: str) -> Any:
 
 
 def refuse_not_finite(value: Any, path: str) -> None:
-    """Raises ConfigError for a number that is not finite, anywhere below a key: nan passes every comparison."""
+    """Raise ConfigError for an infinite number or NaN anywhere below a key: NaN passes every comparison."""
     if isinstance(value, dict):
         for key, inner in value.items():
             refuse_not_finite(inner, f"{path}.{key}".lstrip("."))
@@ -64,7 +64,7 @@ def refuse_not_finite(value: Any, path: str) -> None:
 
 
 def writable(node: DictConfig, values: dict[str, Any]) -> DictConfig:
-    """Unlocks the nodes of frozen dataclasses, into which OmegaConf cannot merge; `values`: what will be merged."""
+    """Unlock the nodes of frozen dataclasses for OmegaConf to merge into; `values`: to be merged."""
     OmegaConf.set_readonly(node, False)
     for key in node:
         child = node._get_node(key)
@@ -72,29 +72,28 @@ def writable(node: DictConfig, values: dict[str, Any]) -> DictConfig:
             inner = values.get(str(key))
             absent = child._is_missing() or (child._is_none() and isinstance(inner, dict))
             if absent and dataclasses.is_dataclass(child._metadata.ref_type):
-                child._set_value(child._metadata.ref_type)  # its fields must be there to be made writable
+                child._set_value(child._metadata.ref_type)  # creates the fields to unlock
             if not child._is_none():
                 writable(child, inner if isinstance(inner, dict) else {})
     return node
 
 
 def complaint(error: OmegaConfBaseException, schema: type, path: str) -> str:
-    """Returns what is wrong at which key, in one sentence."""
+    """Return an error of OmegaConf as one sentence with the key."""
     inner = str(error.full_key or "")
     key, text = ".".join(part for part in (path, inner) if part), first_line(error)
     if type(error).__name__ == "ConfigKeyError":
-        options = [f"{path}.{k}".lstrip(".") for k in schema_keys(schema)]
-        return f"'{key}' is no configuration key.{right_key(key, options)}"
+        return unknown_key(key, [f"{path}.{k}".lstrip(".") for k in schema_keys(schema)])
     if "is not a ListConfig" in text:
         return f"{key} takes a list: give {key}=[...], with commas between its values"
     if (group := re.search(r"is not a subclass of (\w+)", text)) is not None:
         key = ".".join([part for part in (path, key_of_type(schema, group[1])) if part]) or key
-        return f"{key} is no value but a group of settings: give {key}.NAME=VALUE"
+        return f"{key} is a group of settings, not a value: give {key}.NAME=VALUE"
     return f"{key}: {text}"
 
 
 def key_of_type(schema: type, name: str, prefix: str = "") -> str:
-    """Returns the dotted name of the first field that is a dataclass of that name, or an empty text."""
+    """Return the dotted name of the first field that is a dataclass of that name, or an empty text."""
     for entry in dataclasses.fields(schema):
         if not dataclasses.is_dataclass(entry.type):
             continue
@@ -106,13 +105,15 @@ def key_of_type(schema: type, name: str, prefix: str = "") -> str:
     return ""
 
 
-def right_key(key: str, known: Iterable[str]) -> str:
-    """Returns ` It is now called 'x'.` for a key of older versions, else ` Did you mean 'x'?` or an empty text."""
-    return advice(key) or nearest(key, known)
+def unknown_key(
+    key: str, known: Iterable[str], where: str = "", remedy: str = " `gsx --cfg job` lists all keys."
+) -> str:
+    """Return an error that names the key's new name, else the nearest key, else `remedy`."""
+    return f"Unknown key '{key}'{where}.{advice(key) or nearest(key, known) or remedy}"
 
 
 def schema_keys(schema: type, prefix: str = "") -> Iterator[str]:
-    """Yields dotted field names of a dataclass and of those inside it, with keys of mappings by default."""
+    """Yield dotted field names of a dataclass and of those inside it, with keys of mappings by default."""
     for entry in dataclasses.fields(schema):
         yield f"{prefix}{entry.name}"
         made = entry.default_factory() if entry.default_factory is not dataclasses.MISSING else None
@@ -122,14 +123,14 @@ def schema_keys(schema: type, prefix: str = "") -> Iterator[str]:
 
 
 def dotted(node: Any, prefix: str = "") -> Iterator[str]:
-    """Yields dotted paths of all keys, inner nodes included."""
+    """Yield dotted paths of all keys, inner nodes included."""
     for key, value in node.items() if isinstance(node, dict) else ():
         yield f"{prefix}{key}"
         yield from dotted(value, f"{prefix}{key}.")
 
 
 def texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
-    """Yields (key, text) of all texts inside nested mappings and lists."""
+    """Yield (key, text) of all texts inside nested mappings and lists."""
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for name, one in inner:
         yield from texts(one, f"{key}.{name}".lstrip("."))

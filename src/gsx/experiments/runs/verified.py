@@ -1,4 +1,4 @@
-"""Photographs are all decoded once before training: a damaged one is told now, not after an hour."""
+"""Decodes all photos once before training, so that a damaged one is reported now, not after an hour."""
 
 import logging
 import os
@@ -17,27 +17,27 @@ from gsx.scenes.photo_source import PhotoSource
 logger = logging.getLogger(__name__)
 
 NAMED = 3
-"""Damaged photographs that an error quotes."""
+"""Damaged photos that an error quotes."""
 LONG = 200
-"""Photographs from which on it is said that they are being looked at."""
+"""Least number of photos whose check is announced."""
 
 
 def verified(scene: Scene) -> Scene:
-    """Returns the scene if its photographs and masks can be decoded; remembers them by name, size and time.
+    """Return the scene if its photos and masks can be decoded; remember them by name, size and time.
 
     Raises:
         InputError: some are damaged or missing.
     """
     sources = [view.source for view in (*scene.train, *scene.test)]
-    photographs = [source for source in sources if isinstance(source, PhotoSource)]
-    masks = [source.mask.path for source in photographs if source.mask is not None]
-    paths = list(dict.fromkeys([*(source.path for source in photographs), *masks]))
+    photos = [source for source in sources if isinstance(source, PhotoSource)]
+    masks = [source.mask.path for source in photos if source.mask is not None]
+    paths = list(dict.fromkeys([*(source.path for source in photos), *masks]))
     if not paths or whole(known := remembered(paths)):
         return scene
     if len(paths) >= LONG:
-        logger.info("looking at all %d photographs once", len(paths))
+        logger.info("checking all %d photos once", len(paths))
     refuse_damaged(paths)
-    with suppress(OSError):  # without a cache they are looked at again next time
+    with suppress(OSError):  # without a cache they are checked again next time
         known.parent.mkdir(parents=True, exist_ok=True)
         write_json(known, [str(path) for path in paths])
         enlist(known)
@@ -45,20 +45,16 @@ def verified(scene: Scene) -> Scene:
 
 
 def remembered(paths: Sequence[Path]) -> Path:
-    """Returns the file that says that these, as they are now, could be decoded.
-
-    Raises:
-        InputError: one cannot be looked at.
-    """
+    """Return the cache file of a check of these files as they are; raise InputError if one is missing."""
     try:
         key = content_key([(str(path.resolve()), file_stamp(path)) for path in paths])
         return cache_folder("verified", key) / "photographs.json"
     except OSError as error:
-        raise InputError(f"Image '{error.filename}' cannot be looked at ({error.strerror}): restore it") from error
+        raise InputError(f"Image '{error.filename}' cannot be read ({error.strerror}): restore it") from error
 
 
 def refuse_damaged(paths: Sequence[Path]) -> None:
-    """Raises InputError naming the files that cannot be decoded; several are at a time."""
+    """Decode files in parallel; raise InputError that names those that fail."""
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         problems = [problem for problem in pool.map(problem_of, paths) if problem]
     if problems:
@@ -67,7 +63,7 @@ def refuse_damaged(paths: Sequence[Path]) -> None:
 
 
 def problem_of(path: Path) -> str:
-    """Returns why a file cannot be decoded; empty if it can."""
+    """Return why a file cannot be decoded; empty if it can."""
     try:
         read_image(path)
     except InputError as error:

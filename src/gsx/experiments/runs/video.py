@@ -1,4 +1,4 @@
-"""Photographs out of a video: of each stretch of time the sharpest frame."""
+"""Photos from a video: the sharpest frame of each interval."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -19,20 +19,20 @@ logger = logging.getLogger(__name__)
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 FRAMES = 100
-"""Stretches of time, and so photographs, of a video."""
+"""Intervals of a video, and so photos."""
 LEAST_FRAMES = 10
-"""Fewer frames than that show too little to be reconstructed."""
+"""Least frames of a video: fewer do not show enough of a scene."""
 INDEX = "frames.json"
-"""Written last: which video the folder is of."""
+"""File with the stamp of the folder's video, written last."""
 
 
 def is_video(path: Path) -> bool:
-    """Returns whether a file has the name of a video."""
+    """Return True for a file with the name of a video."""
     return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
 def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
-    """Returns a folder below `output` with the sharpest frame of each of `count` stretches of a video; made once.
+    """Return a folder below `output` with the sharpest frame of each of `count` intervals of a video; made once.
 
     Raises:
         ConfigError: PyAV is not installed.
@@ -52,34 +52,26 @@ def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
 
 
 def chosen(folder: Path, made_of: Sequence[Any]) -> bool:
-    """Returns whether a folder holds these frames."""
+    """Return True if a folder holds these frames."""
     return (folder / INDEX).exists() and bool(read_json(folder / INDEX) == made_of)
 
 
 def choose(path: Path, folder: Path, count: int, made_of: Sequence[Any]) -> None:
-    """Writes the frames of a video to a folder, and then what they are of.
-
-    Raises:
-        InputError: the video cannot be read, or is too short.
-    """
+    """Write frames of a video to a folder, and then its stamp; raise InputError for an unreadable or short video."""
     for old in [folder / INDEX, *folder.glob("frame_*.png")]:
         old.unlink(missing_ok=True)
     total = sum(1 for _ in frames_in(path))
     if total < LEAST_FRAMES:
-        raise InputError(f"'{path}' has {total} frames, too few to reconstruct a scene: film for at least some seconds")
-    stretches = min(count, total)
-    for number, pixels in sharpest(path, total, stretches):
+        raise InputError(f"'{path}' has {total} frames, too few to reconstruct a scene: film for some seconds")
+    intervals = min(count, total)
+    for number, pixels in sharpest(path, total, intervals):
         write_image(folder / f"frame_{number:05d}.png", torch.from_numpy(pixels).permute(2, 0, 1))
     write_json(folder / INDEX, made_of)
-    logger.info("%d of %d frames chosen, the sharpest of each stretch: %s", stretches, total, folder)
+    logger.info("%d of %d frames chosen, the sharpest of each interval: %s", intervals, total, folder)
 
 
 def frames_in(path: Path) -> Iterator[Any]:
-    """Yields frames of the first video stream, decoded one after the other.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """Yield decoded frames of the first video stream; raise InputError if it cannot be read."""
     import av
 
     try:
@@ -92,11 +84,11 @@ def frames_in(path: Path) -> Iterator[Any]:
         raise InputError(f"'{path}' cannot be read as a video ({first_line(error)}): give another file") from error
 
 
-def sharpest(path: Path, total: int, stretches: int) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
-    """Yields (index, pixels) of the sharpest frame of each stretch, in order."""
+def sharpest(path: Path, total: int, intervals: int) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
+    """Yield (index, pixels) of the sharpest frame of each interval, in order."""
     best: tuple[float, int, Any] | None = None
     for number, frame in enumerate(frames_in(path)):
-        if best is not None and number * stretches // total > best[1] * stretches // total:
+        if best is not None and number * intervals // total > best[1] * intervals // total:
             yield best[1], upright_pixels(best[2])
             best = None
         score = sharpness(frame.to_ndarray(format="gray").astype(np.float32))
@@ -107,17 +99,17 @@ def sharpest(path: Path, total: int, stretches: int) -> Iterator[tuple[int, UInt
 
 
 def quarter_turns(frame: Any) -> int:
-    """Returns the quarter turns, counterclockwise, that bring a frame upright: phones film as the sensor lies."""
+    """Return the counterclockwise quarter turns that bring a frame upright: phones film as the sensor lies."""
     return round(getattr(frame, "rotation", 0) / 90)
 
 
 def upright_pixels(frame: Any) -> UInt8[np.ndarray, "H W 3"]:
-    """Returns a frame as players show it."""
+    """Return a frame upright, as players do."""
     return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), quarter_turns(frame)))
 
 
 def sharpness(grey: Float[np.ndarray, "H W"]) -> float:
-    """Returns the variance of the Laplacian, which blur lowers (Pech-Pacheco et al. 2000)."""
+    """Return the variance of the Laplacian, which blur lowers (Pech-Pacheco et al. 2000)."""
     inner = grey[1:-1, 1:-1]
     laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * inner
     return float(laplacian.var())

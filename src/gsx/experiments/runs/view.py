@@ -1,4 +1,4 @@
-"""`gsx view`: a run, also one that another process trains, or a splat file."""
+"""`gsx view`: a run, also during training by another process, or a splat file."""
 
 import time
 from collections.abc import Callable
@@ -21,50 +21,46 @@ from gsx.experiments.viewer.training import status_of
 from gsx.formats.splat_files import read_around
 
 EVERY = 2.0
-"""Seconds between looks at a run's folder."""
+"""Seconds between checks of a run's folder."""
 
 
-class Watched:
-    """A run folder that another process may train in: its newest checkpoint is shown."""
+class WatchedRun:
+    """A run that another process may train, at its newest checkpoint."""
 
     def __init__(self, folder: Path, plugins: Plugins) -> None:
         self.run, self.settings = open_run(folder, plugins)
         raster = self.run.raster
-        self.run.raster = replace(raster, path="eager")  # the first pictures come at once
-        self.compiling = compile_in_background(raster, self.run.device, self.faster)
-        self.looked = time.monotonic()
+        self.run.raster = replace(raster, path="eager")  # the first pictures do not wait for a compiler
+        self.compiling = compile_in_background(raster, self.run.device, self.use)
+        self.checked = time.monotonic()
 
     def refresh(self) -> bool:
-        """Shows a newer checkpoint; returns whether there was one."""
-        if time.monotonic() - self.looked < EVERY:
+        """Restore a newer checkpoint; return True if there was one."""
+        if time.monotonic() - self.checked < EVERY:
             return False
-        self.looked = time.monotonic()
-        there = checkpoint.sidecars(self.run.folder / "checkpoints")
-        if not there or checkpoint.step_of(there[-1]) <= self.run.step:
+        self.checked = time.monotonic()
+        sidecars = checkpoint.sidecars(self.run.folder / "checkpoints")
+        if not sidecars or checkpoint.step_of(sidecars[-1]) <= self.run.step:
             return False
         try:
             checkpoint.restore(self.run)
-        except (CheckpointError, OSError):  # it may be half written, or gone already: the next look finds out
+        except (CheckpointError, OSError):  # half written, or gone already: check again later
             return False
         self.run.progress.curves = read_curves(self.run.folder)
         return True
 
-    def faster(self, raster: RasterSettings) -> None:
-        """Draws by these rules from now on."""
+    def use(self, raster: RasterSettings) -> None:
+        """Render by these settings from now on."""
         self.run.raster = raster
 
     def state(self) -> str:
-        """Returns the state of the run in words."""
+        """Return the state of the run in words."""
         return f"{status_of(self.run)}, {state_of(read_run(self.run.folder))[0]}"
 
 
 def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Callable[[str], None]) -> None:
-    """Shows a run until Ctrl-C.
-
-    Raises:
-        InputError, CheckpointError: there is nothing to show, or the port is taken.
-    """
-    watched = Watched(folder, plugins)
+    """Show a run until Ctrl-C; raise InputError if the port is taken, or as `open_run`."""
+    watched = WatchedRun(folder, plugins)
     viewer = Viewer(RunModel(watched.run), f"{watched.run.scene.name}, {folder.name}", host, port)
     viewer.show_status(watched.state())
     announce(viewer.address)
@@ -75,7 +71,7 @@ def view_run(folder: Path, plugins: Plugins, host: str, port: int, announce: Cal
 
 
 def view_file(path: Path, axes: str, host: str, port: int, announce: Callable[[str], None]) -> None:
-    """Shows a splat file until Ctrl-C; axes: the file's. Errors as `view_run`."""
+    """Show a splat file until Ctrl-C; `axes`: of the file."""
     watch_cores()
     gaussians, origin = read_around(path, axes)
     if not len(gaussians.means):

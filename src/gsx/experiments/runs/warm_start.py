@@ -1,7 +1,7 @@
-"""What runs have in common until the first of them makes pseudo views: trained once, kept, and branched from.
+"""States that runs share until their first pseudo views: trained once, kept in the cache, and branched from.
 
-With `init=warm_start` a run starts from the latest state that an earlier run of the same composition, but for its
-augmenters, has left behind, and leaves states for later ones. The result is bit for bit that of a run from scratch.
+With `init=warm_start` a run starts from the latest kept state of an earlier run that differs only in its augmenters,
+and keeps states for later ones. The result has the same bits as a run from scratch.
 """
 
 import hashlib
@@ -24,24 +24,24 @@ from gsx.experiments.run_folder.run_key import scene_stamp, trained
 logger = logging.getLogger(__name__)
 
 BRANCH = "branch.json"
-"""File of a run that branched: at which step, and how many seconds of training it did not have to take."""
+"""File of a run that branched, with the step and the seconds of training saved."""
 
 SHARES = (10 / 40, 15 / 40, 20 / 40, 22 / 40, 30 / 40)
-"""Where the paper's variants begin, of a whole run, and last where conf/augmenter/upscale does: states are kept there
-(the paper, Experimental Setup)."""
+"""Shares of a run after which states are kept: where the paper's variants begin (the paper, Experimental Setup), and
+last where conf/augmenter/upscale does."""
 
 
 def common_steps(run: Run) -> int:
-    """Returns the steps that a run shares with its baseline: up to the first pseudo views, or all of them."""
+    """Return the steps that a run shares with its baseline: up to the first pseudo views, or all of them."""
     return min([run.iterations, *(augmenter.begins() for augmenter in run.augmenters.values())])
 
 
 def warm_start_folder(run: Run, idle: Collection[str], plugins: Mapping[str, str]) -> Path:
-    """Returns where states of such runs are kept; `idle`: keys that change no result; `plugins`: versions."""
+    """Return the folder of states of such runs; `idle`: keys that change no result; `plugins`: versions."""
     machine = (*machine_stamp(run.device), run.raster.path)
     parts = (
         json.dumps(trained(without_augmenters(run.config), idle), sort_keys=True, default=str),
-        scene_stamp(run.config),  # test views are among the lines that are kept with a state
+        scene_stamp(run.config),  # lines that are kept with a state include test views
         training_data_digest(run),
         source_revision(),
         sorted(plugins.items()),
@@ -51,12 +51,12 @@ def warm_start_folder(run: Run, idle: Collection[str], plugins: Mapping[str, str
 
 
 def without_augmenters(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the composition of the baseline."""
+    """Return the composition of the baseline."""
     return {key: value for key, value in config.items() if key not in ("augmenter", "regenerator", "checks")}
 
 
 def training_data_digest(run: Run) -> str:
-    """Returns a digest of what a run is trained on: cameras, points, and the files of photographs."""
+    """Return a digest of the training data: cameras, points, and the files of photos."""
     digest = hashlib.sha256(run.scene.points.positions.numpy().tobytes())
     digest.update(run.scene.points.colours.numpy().tobytes())
     for view in run.scene.train:
@@ -68,7 +68,7 @@ def training_data_digest(run: Run) -> str:
 
 
 def adopt(run: Run, folder: Path) -> None:
-    """Brings a new run to the latest state that it has in common with an earlier one, if there is any."""
+    """Bring a new run to the latest kept state that it shares with an earlier one, if there is any."""
     common = common_steps(run)
     for sidecar in reversed([path for path in checkpoint.sidecars(folder) if checkpoint.step_of(path) <= common]):
         try:
@@ -86,13 +86,13 @@ def adopt(run: Run, folder: Path) -> None:
 
 
 def branch(run: Run, sidecar: Path) -> None:
-    """Starts from a kept state: copies its checkpoint and its lines of metrics.jsonl."""
-    own = run.folder / "checkpoints"
-    own.mkdir(parents=True, exist_ok=True)
+    """Start from a kept state: copy its checkpoint and its lines of metrics.jsonl."""
+    checkpoints = run.folder / "checkpoints"
+    checkpoints.mkdir(parents=True, exist_ok=True)
     tensors, lines = sidecar.with_suffix(".safetensors"), read_json(lines_at(sidecar))["lines"]
-    replace_file(own / tensors.name, tensors.read_bytes())
+    replace_file(checkpoints / tensors.name, tensors.read_bytes())
     replace_text(run.folder / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
-    replace_file(own / sidecar.name, sidecar.read_bytes())  # last: without it a checkpoint does not exist
+    replace_file(checkpoints / sidecar.name, sidecar.read_bytes())  # last: without it a checkpoint does not exist
     checkpoint.restore(run, training=True)
     write_json(run.folder / BRANCH, {"step": run.step, "seconds": run.progress.seconds})
     logger.info(
@@ -101,7 +101,7 @@ def branch(run: Run, sidecar: Path) -> None:
 
 
 def lines_at(sidecar: Path) -> Path:
-    """Returns the file of the lines of metrics.jsonl up to a kept state."""
+    """Return the file with the lines of metrics.jsonl up to a kept state."""
     return sidecar.with_name(f"lines_{sidecar.stem}.json")
 
 
@@ -113,7 +113,7 @@ class WarmStartKeeper:
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
-        """Keeps this state if runs can share it; a cache that cannot be written is no error."""
+        """Keep this state if runs can share it; a cache that cannot be written is not an error."""
         common = common_steps(run)
         steps = {*(self.steps or (round(share * run.iterations) for share in SHARES)), common}
         if run.step not in steps or run.step > common or run.complete:
@@ -124,7 +124,7 @@ class WarmStartKeeper:
             logger.warning("init=warm_start: the state of step %d is not kept (%s)", run.step, error)
 
     def keep(self, run: Run) -> None:
-        """Writes the state where other runs look for it."""
+        """Write the state to the cache."""
         folder = make_folder(self.folder)
         kept = [path for path in checkpoint.sidecars(folder) if checkpoint.step_of(path) == run.step]
         if kept and whole(lines_at(kept[0])):
