@@ -71,7 +71,7 @@ def test_a_splat_file_draws_what_its_run_does(run: gsx.TrainedRun, tmp_path: Pat
     ):
         with pytest.raises(InputError, match=told):
             splats.render(camera, wrong)
-    with pytest.raises(InputError, match="is no camera: give one, or a view"):
+    with pytest.raises(InputError, match="is not a camera: give one, a view"):
         splats.render("test_000")
     assert repr(splats) == f"<300 splats of {tmp_path / 'model.ply'}>"
     with pytest.raises(InputError, match=r"gsx writes .*\.ply"):
@@ -84,7 +84,7 @@ def test_a_folder_is_opened_as_it_was_left(run: gsx.TrainedRun) -> None:
     assert torch.equal(opened.render(opened.scene.test[0]), run.render(run.scene.test[0]))
     with pytest.raises(InputError, match="does not exist"):
         gsx.load(run.folder / "nothing")
-    with pytest.raises(InputError, match="drawn as it was trained: raster is for splat files"):
+    with pytest.raises(InputError, match="rendered as it was trained: raster is for splat files"):
         gsx.load(run.folder, raster=run.run.raster)
     assert repr(opened) == f"<run of 3 steps in {run.folder}>"
 
@@ -96,13 +96,13 @@ def test_a_home_is_looked_for(run: gsx.TrainedRun, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("given", [Path("photos"), "photos", {"seed": 3}, 4])
 def test_what_is_no_setting_is_refused(given: Any) -> None:
-    with pytest.raises(ConfigError, match=r"give settings, as 'scene=colmap' and 'scene\.path=FOLDER'"):
+    with pytest.raises(ConfigError, match=r"give settings, for example 'scene=colmap'"):
         gsx.train(given)
 
 
 @pytest.mark.parametrize("seen", [0, None, Path("test_000")])
 def test_what_is_no_camera_is_refused(run: gsx.TrainedRun, seen: Any) -> None:
-    with pytest.raises(InputError, match="is no camera: give one, or a view"):
+    with pytest.raises(InputError, match="is not a camera: give one, a view"):
         run.render(seen)
 
 
@@ -164,7 +164,7 @@ def test_texts_arrive_as_they_are(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["${oc.env:HOME}", "x\\${seed}", "\\\\${a}'"])
 def test_texts_are_looked_up_nowhere(name: str) -> None:
-    with pytest.raises(ConfigError, match=re.escape(f"folder is '{name}'; a run's configuration holds no")):
+    with pytest.raises(ConfigError, match=re.escape(f"folder is '{name}'; ")):
         compose([*OVERRIDES, *words_of({"folder": name})], plugins())
 
 
@@ -200,7 +200,7 @@ def test_the_page_does_what_it_says(
 def test_options_that_would_change_nothing_are_refused(run: gsx.TrainedRun, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"is a run, .*: origin is for splat files"):
         gsx.load(run.folder, origin=(1.0, 2.0, 3.0))
-    with pytest.raises(InputError, match=r"axes and version are of \.spz files"):
+    with pytest.raises(InputError, match=r"axes and SPZ version are for \.spz files"):
         run.export(tmp_path / "a.ply", axes="rdf")
     assert not list(tmp_path.iterdir())
 

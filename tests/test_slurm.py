@@ -61,7 +61,7 @@ def test_a_requeued_job_goes_on_and_the_table_is_that_of_one_process(tmp_path: P
         logs = "".join(p.read_text() for p in checkpoints.glob("experiments/*/launched/*/.submitit/**/*_log.err"))
     assert table.returncode == 0, said + logs
     assert "stopped at step" in logs
-    assert "going on with" in logs
+    assert "continuing" in logs
     (tmp_path / "alone").mkdir()
     alone = gsx(TABLE, tmp_path / "alone", dict(os.environ))
     told, _ = alone.communicate(timeout=300)

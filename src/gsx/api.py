@@ -188,9 +188,7 @@ def train(*words: str, **values: Any) -> TrainedRun:
     """
     for word in words:
         if not (isinstance(word, str) and is_override(word) and not word.startswith("-")):
-            raise ConfigError(
-                f"gsx.train cannot use {word!r}: give settings, for example 'scene=colmap'"
-            )
+            raise ConfigError(f"gsx.train cannot use {word!r}: give settings, for example 'scene=colmap'")
     overrides, folders = [*words, *words_of(values)], list[Path]()
     if is_table(overrides) or processes() > 1:
         raise ConfigError("gsx.train trains one run in one process: tables and torchrun are for the command line")

@@ -741,7 +741,7 @@ def test_what_cannot_work_is_refused_before_training(tmp_path: Path) -> None:
         (boot, "augmenter.bootstrap.scales=[2]"): "identity cannot enlarge x2",
         (up, "augmenter.upscale.role=upscal"): "no regenerator is chosen for 'upscal'",
         (up, "augmenter.upscale.scales=[16]"): "are 2 x 1 px; 4 px are the least",
-        (up, "augmenter.upscale.mode=hybrid", "augmenter.upscale.weights=[0.6,1.0]"): "take the whole loss",
+        (up, "augmenter.upscale.mode=hybrid", "augmenter.upscale.weights=[0.6,1.0]"): "replace the whole loss",
     }.items():
         with pytest.raises(ConfigError, match=complaint):
             start(tiny_settings(tmp_path / "run", *PLAIN, *words), plugins())

@@ -102,12 +102,12 @@ def test_eval_draws_by_the_path_of_training_and_names_it(
 
     path, told = evaluated()
     assert path == "compiled"
-    assert "renders/s are now by the compiled path; the evaluation before had" in told
+    assert "renders/s are measured with the compiled path; the" in told
     path, told = evaluated("eval.zoom=[1,2]")
-    assert (path, "are now by" in told) == ("compiled", False)
+    assert (path, "are measured with" in told) == ("compiled", False)
     path, told = evaluated("rasterizer.path=eager")
     assert path == "eager"
-    assert re.search(r"renders/s are now by the eager path; .* had [\d.]+ by the compiled path", told)
+    assert re.search(r"renders/s are measured with the eager path; the [\d.]+ of .* before \(compiled path\)", told)
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -251,7 +251,7 @@ def test_modules_in_the_current_folder_are_not_taken_for_libraries(multirun: Mul
 
 def test_a_mistake_in_a_multirun_is_refused_before_it_starts(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["-m", "stpes=5", "seed=0,1"]) == 2
-    assert "'stpes' is no configuration key" in capsys.readouterr().err
+    assert "Unknown key 'stpes'" in capsys.readouterr().err
 
 
 def test_a_wrong_value_in_a_multirun_is_kept_nowhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -424,24 +424,24 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     "a value for hydra": (lambda t: words(t / "run", "hydra=3"), "give hydra.NAME=VALUE or hydra/GROUP=NAME"),
     "several values for one run": (
         lambda t: words(t / "run", "scene.split=files:a.txt,b.txt"),
-        "gsx -m runs one after the other; 'scene.split=\"files:a.txt,b.txt\"' is one text",
+        "gsx -m trains once for each; 'scene.split=\"files:a.txt,b.txt\"' is one text",
     ),
     "a wrong choice among others": (
         lambda t: ["-m", "backbone=gs3d,nope", f"output={t / 'out'}"],
-        "backbone=nope: there is no such backbone; choose from",
+        "Unknown backbone 'nope'. Choose from",
     ),
     "a key that not all choices have": (
         lambda t: ["-m", "backbone=gs3d,scaffold", "backbone.sh_degree=2", f"output={t / 'out'}"],
-        "'backbone.sh_degree' is no configuration key",
+        "Unknown key 'backbone.sh_degree'",
     ),
     "a report of nothing, elsewhere": (lambda t: ["report", str(t / "no"), "--to", str(t / "page")], "is no folder"),
     "fewer steps than taken": (
         lambda t: ["resume", str(run_at_step(t / "run", 3)), "iterations=2"],
-        "has come to step 3, and iterations=2 is less",
+        "is at step 3, iterations=2 is less",
     ),
     "a key without a value": (
         lambda t: ["resume", str(run_at_step(t / "run", 1)), "iterations"],
-        "'iterations' is given no value: write iterations=VALUE",
+        "'iterations' has no value: write iterations=VALUE",
     ),
     "a run without a checkpoint": (
         lambda t: ["resume", str(without_checkpoints(run_at_step(t / "run", 1)))],
@@ -449,7 +449,7 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     ),
     "a folder that is a file": (
         lambda t: ["compact", str(run_at_step(t / "run", 1)), "--to", str(broken_ply(t / "x.ply"))],
-        "is a file, no folder for a run",
+        "is a file, not a folder for a run",
     ),
     "a sweep of nothing": (
         lambda t: ["-m", "seed=range(5,5)", f"output={t / 'out'}"],
@@ -469,22 +469,22 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     ),
     "a sweep that is shown": (
         lambda t: ["-m", "--cfg", "job", "seed=0,1"],
-        "-m trains several runs, and --cfg trains none: leave one of them out",
+        "-m trains several runs, --cfg trains none: leave one of them out",
     ),
     "a launcher of no processes": (
         lambda t: ["-m", "seed=0,1", "hydra/launcher=processes", "hydra.launcher.n_jobs=0", f"output={t / 'out'}"],
-        "hydra.launcher.n_jobs is 0; give how many processes",
+        "hydra.launcher.n_jobs is 0; give a number of processes",
     ),
     "a folder for a movie": (
         lambda t: ["render", str(t / "run"), "--orbit", str(t / "a.gif"), "--to", str(t / "to")],
         "--to FOLDER is for pictures",
     ),
     "frames of no orbit": (lambda t: ["render", str(t / "run"), "--frames", "3"], "go with --orbit FILE"),
-    "axes of no spz": (lambda t: ["export", str(t / "run"), str(t / "x.ply"), "--axes", "rdf"], "are of .spz files"),
-    "trade": (lambda t: ["trade", "training"], "whose page draws the fronts"),
+    "axes of no spz": (lambda t: ["export", str(t / "run"), str(t / "x.ply"), "--axes", "rdf"], "are for .spz files"),
+    "trade": (lambda t: ["trade", "training"], "whose page plots quality against cost"),
     "a choice that is there twice": (
         lambda t: words(t / "run", "iterations=1", "augmenter=[upscale,bootstrap,upscale]"),
-        "augmenter=[upscale,bootstrap,upscale]: upscale is there twice, and works once",
+        "augmenter=[upscale,bootstrap,upscale] names upscale twice: leave one out",
     ),
     "a word that no scene knows": (
         lambda t: words(t / "run", "iterations=1", "scene.masks=alpa"),
@@ -494,7 +494,10 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
         lambda t: words(t / "run", "iterations=1", "scene.resize_filter=cubic"),
         "scene.resize_filter is 'cubic', use one of bicubic, area, lanczos. Did you mean 'bicubic'?",
     ),
-    "datasets nowhere": (lambda t: ["datasets", f"data_root={t / 'no'}"], "is no folder: give the one below which"),
+    "datasets nowhere": (
+        lambda t: ["datasets", f"data_root={t / 'no'}"],
+        "is not a folder: give the folder that",
+    ),
     "more steps of an evaluation": (
         lambda t: ["eval", str(run_of_old(t / "my run")), "iterations=40"],
         "/my run shows: leave it out; gsx resume '",
@@ -510,7 +513,7 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     ),
     "compact with a place of its own": (
         lambda t: ["compact", str(run_of_old(t / "run")), f"output={t / 'o'}"],
-        "--to FOLDER says where the smaller run goes",
+        "--to FOLDER names the folder of the smaller run",
     ),
     "a photograph of no run": (lambda t: ["photographs"], "the following arguments are required: RUN. See"),
     "an export of no run": (lambda t: ["export"], "the following arguments are required: RUN|FILE. See"),
@@ -569,7 +572,7 @@ def test_ctrl_c_saves_a_checkpoint_and_says_how_to_resume(begin: Begin, tmp_path
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=120)
     assert process.returncode == 130
-    found = re.search(r"stopped at step (\d+); go on with: gsx resume (\S+)", err)
+    found = re.search(r"stopped at step (\d+); continue with: gsx resume (\S+)", err)
     assert found
     assert found.group(2) == str(tmp_path / "run")
     assert list((tmp_path / "run" / "checkpoints").glob(f"step_{int(found.group(1)):07d}.safetensors"))
@@ -581,7 +584,7 @@ def test_slurm_is_refused_where_there_is_none(
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main([*words, "hydra/launcher=slurm", f"output={tmp_path / 'out'}"]) == 2
-    assert "hydra/launcher=slurm: this machine has no Slurm, no srun is on the PATH" in capsys.readouterr().err
+    assert "hydra/launcher=slurm: this machine has no Slurm (srun is not on the PATH)" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -596,7 +599,7 @@ def test_a_launcher_that_fails_is_one_sentence(
     monkeypatch.setattr(BasicLauncher, "launch", failing)
     assert main(["-m", "seed=0,1", "iterations=1", f"output={tmp_path}"]) == 2
     assert capsys.readouterr().err == (
-        "gsx: the launcher failed (RuntimeError: no such partition): mend its settings, or choose "
-        "hydra/launcher=basic: one run after the other, here\n"
+        "gsx: the launcher failed (RuntimeError: no such partition): correct its settings, or run "
+        "one after the other here with hydra/launcher=basic\n"
     )
     assert os.environ.get("HYDRA_FULL_ERROR") != "1"  # what other errors of this process print stays as it was

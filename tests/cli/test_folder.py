@@ -32,7 +32,7 @@ from gsx.scenes.photos import find_photos
 def trained(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """Words of what would be trained."""
     given: list[list[str]] = []
-    monkeypatch.setattr(folders, "verb_train", lambda words: given.append(words) or 0)
+    monkeypatch.setattr(folders, "train", lambda words: given.append(words) or 0)
     return given
 
 
@@ -59,11 +59,12 @@ def test_pictures_of_a_sog_are_no_photos(
         write_image(tmp_path / f"{name}.png", torch.rand(3, 8, 8))
         (tmp_path / f"{name}.png").rename(tmp_path / f"{name}.webp")
     assert main([str(tmp_path)]) == 2
-    assert "pictures of a SOG (means_l.webp) and no meta.json" in capsys.readouterr().err
+    assert "pictures of a SOG (means_l.webp) but no meta.json" in capsys.readouterr().err
     (tmp_path / "meta.json").write_text('{"version": 2, "means": {}, "scales": {}, "quats": {}, "sh0": {}}')
     assert main([str(tmp_path)]) == 2
     assert (
-        f"{tmp_path} is an unbundled SOG, whose pictures hold splats (meta.json): gsx view" in capsys.readouterr().err
+        f"{tmp_path} is an unbundled SOG, whose pictures hold splats (meta.json), not a scene"
+        in capsys.readouterr().err
     )
     assert main(["scenes", str(tmp_path)]) == 2
     assert "is an unbundled SOG" in capsys.readouterr().out
@@ -92,10 +93,10 @@ def test_a_path_that_exists_is_no_override(
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("empty", "is no scene"),
-        ("run", "is a run: gsx view"),
-        ("a.ply", "is a splat file: gsx view"),
-        ("notes.txt", "is no folder"),
+        ("empty", "is not a scene"),
+        ("run", "is a run, not a scene. Use it with gsx view"),
+        ("a.ply", "is a splat file, not a scene. Use it with gsx view"),
+        ("notes.txt", "is not a folder"),
     ],
 )
 def test_what_is_no_scene_is_told_with_a_remedy(
@@ -116,7 +117,7 @@ def test_a_scene_beside_it_makes_no_sense(tmp_path: Path, capsys: pytest.Capture
     assert main([str(tmp_path), "scene=demo"]) == 2
     assert "'scene=demo' does not go with it" in capsys.readouterr().err
     assert main([str(tmp_path / "none")]) == 2
-    assert "is no verb of gsx, and no folder" in capsys.readouterr().err
+    assert "Unknown command or path" in capsys.readouterr().err
 
 
 def test_sharpness_by_hand() -> None:

@@ -229,7 +229,7 @@ def test_a_stop_asked_of_one_process_stops_both_after_the_same_step(tmp_path: Pa
     """And `gsx resume` on two processes ends as if nobody had asked."""
     words = (*OVERRIDES, *GS3D)
     stopped = together(*words, f"folder={tmp_path / 'run'}", program=(FAILING,), KIND="stop", WHO="1")
-    assert sentences(stopped) == [f"gsx: stopped at step 5; go on with: gsx resume {tmp_path / 'run'}"]
+    assert sentences(stopped) == [f"gsx: stopped at step 5; continue with: gsx resume {tmp_path / 'run'}"]
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "interrupted"
     again = together("resume", str(tmp_path / "run"))
     assert again.returncode == 0, again.stderr

@@ -374,9 +374,9 @@ def test_a_splat_file_is_made_smaller(folder: Path, tmp_path: Path) -> None:
     ("words", "complaint"),
     [
         (["nowhere"], "does not exist: give a run folder or a splat file"),
-        (["{folder}", "--max-drop-db", "0"], "is no number above 0"),
+        (["{folder}", "--max-drop-db", "0"], "give a number above 0"),
         (["{folder}", "--to", "{folder}"], "is not empty: give another with --to FOLDER"),
-        (["{folder}/point_cloud.ply"], "needs the photographs to compare with"),
+        (["{folder}/point_cloud.ply"], "needs photos to compare with"),
     ],
 )
 def test_mistakes_are_told(

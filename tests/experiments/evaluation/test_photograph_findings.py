@@ -22,7 +22,7 @@ from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.files import read_run, state_of
-from gsx.experiments.runs.photo_check import different, findings_of, lines
+from gsx.experiments.runs.photo_check import different, findings_of, summary_lines
 from gsx.modules.alignment import Motion, moved, rotation_by
 from gsx.modules.shifts import shift_of
 
@@ -265,12 +265,12 @@ def test_views_that_several_steps_show_are_looked_at_once(run: Run) -> None:
 
 
 def test_lines_on_the_terminal() -> None:
-    assert lines([finding("a"), finding("b", psnr=31.0)], 10) == [
-        "training photographs: 2, median 30.50 dB; standing out: 0"
+    assert summary_lines([finding("a"), finding("b", psnr=31.0)], 10) == [
+        "training photos: 2, median 30.50 dB; with remarks: 0"
     ]
     wrong = [replace(finding(name), remarks=["is odd", "and old"]) for name in "abc"]
-    assert lines(wrong, 2) == [
-        "training photographs: 3, median 30.00 dB; standing out: 3",
+    assert summary_lines(wrong, 2) == [
+        "training photos: 3, median 30.00 dB; with remarks: 3",
         *(f"{name}  30.00 dB  is odd; and old" for name in "ab"),
         "and 1 more in photographs/index.json",
     ]
@@ -282,10 +282,10 @@ def test_mistakes_are_named(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "photographs").mkdir()
     for words, told in (
-        ([str(tmp_path)], "is no run folder"),
-        ([str(run.folder), "--worst", "0"], "'0' is no whole number of 1 or more"),
-        ([str(run.folder), "scene.nothing=1"], "'scene.nothing' is no key of"),
-        ([], "to train from that folder, gsx ./photographs"),
+        ([str(tmp_path)], "is not a run folder"),
+        ([str(run.folder), "--worst", "0"], "give a whole number of 1 or more"),
+        ([str(run.folder), "scene.nothing=1"], "Unknown key 'scene.nothing' for"),
+        ([], "train from that folder: gsx ./photographs"),
     ):
         assert main(["photographs", *words]) == 2
         assert told in capsys.readouterr().err

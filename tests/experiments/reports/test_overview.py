@@ -479,7 +479,7 @@ def test_every_state_is_shown_with_its_reason_beside_sound_runs(tmp_path: Path) 
     (tmp_path / "bare" / "config.yaml").write_text("iterations: 5")
     page = Page(write_overview(tmp_path))
     assert page.row("ok")[1] == "ok"
-    assert page.row("running")[1] == "running under way or killed: 30 of 100 steps, not evaluated"
+    assert page.row("running")[1] == "running running or killed: 30 of 100 steps, not evaluated"
     assert page.row("interrupted")[1] == "interrupted 30 of 100 steps, not evaluated"
     assert page.row("failed")[1] == "failed three non-finite steps"
     assert page.row("corrupted")[1].startswith("corrupted evaluation.json cannot be read")

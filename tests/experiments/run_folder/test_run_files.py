@@ -152,7 +152,7 @@ def test_a_composition_that_was_trained_is_completed_and_never_trained_again(
     picture = next((run / "renders").glob("*.truth.png"))
     for change in (without(f"renders/{picture.name}"), cut("point_cloud.ply"), without("environment.json")):
         change(run)
-        assert "going on with" in given_again()
+        assert "continuing" in given_again()
         assert state_of(read_run(run)) == ("ok", "")
         assert (run / f"{CHECKPOINT}.safetensors").read_bytes() == model
     for change in (without("metrics.jsonl"), cut(f"{CHECKPOINT}.safetensors"), without("log.txt")):

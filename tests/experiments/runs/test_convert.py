@@ -142,5 +142,5 @@ def test_a_file_whose_name_shows_no_format_is_a_file(
         if remedy or verb == ["photographs"]:
             assert main([verb[0], name, *verb[1:]]) == 2
             message = capsys.readouterr().err
-            assert f"{name} is a file and no run folder" in message
+            assert f"{name} is a file, not a run folder" in message
             assert ("let its name end in one of .compressed.ply, .ply, .spz" in message) == remedy

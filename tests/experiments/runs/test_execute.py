@@ -95,7 +95,7 @@ def test_a_model_that_loses_zoomed_in_ends_with_what_to_try(finished: Path) -> N
         return remedies(run, {"zoom": zoom | {"8": {"unavailable": "no truth"}}}, remedy)
 
     (line,) = told(x1=None, x2=True, x4=False)
-    assert line.endswith("the same command with backbone=gs3d_zoom")
+    assert line.endswith("repeat the command with backbone=gs3d_zoom")
     assert told(x1=None, x2=True, x4=True) == told(**{"x0.5": False}) == told("", x4=False) == []
     run.raster = replace(run.raster, compensate=True)
     assert told(x4=False) == []

@@ -71,7 +71,7 @@ def test_kinds(key: str, kind: str) -> None:
 
 
 def test_an_unknown_key_gets_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(ConfigError, match=r"'trainin\.batch' is no configuration key\. Did you mean 'training\.batch'"):
+    with pytest.raises(ConfigError, match=r"Unknown key 'trainin\.batch'\. Did you mean 'training\.batch'"):
         explain("trainin.batch", [], plugins())
     assert main(["explain", "training.batch", "training.batch=2"]) == 0
     assert capsys.readouterr().out.startswith("training.batch = 2\n")

@@ -111,7 +111,7 @@ def test_a_run_that_asked_for_no_code_goes_eagerly_where_it_cannot_be_compiled(
     """A disk of the cache that is full, say."""
     monkeypatch.setattr(execution, "warm", at_call(1, execution.warm, CompilerError("blend cannot be compiled (full)")))
     tiny_run(tmp_path / "run", (*SHORT, "rasterizer.path=auto", "rasterizer.auto_steps=1"))
-    assert "blend cannot be compiled (full); going on with the eager path" in caplog.text
+    assert "blend cannot be compiled (full); using the eager path" in caplog.text
     assert json.loads((tmp_path / "run" / "environment.json").read_text())["rasterizer"] == "eager"
     ends, other = final_tensors(tmp_path / "run"), final_tensors(whole)
     assert all(torch.equal(ends[name], other[name]) for name in other)
@@ -134,7 +134,7 @@ def test_a_disk_that_stays_full_does_not_hide_the_error(
     monkeypatch.setattr("gsx.experiments.run_folder.checkpoint.write", at_call(1, checkpoint.write, full_disk()))
     with loaded.listening([Raises(RuntimeError("first"), 5)]), pytest.raises(RuntimeError, match="first"):
         execute(run, settings, loaded)
-    assert "the checkpoint of step 5 could not be kept" in caplog.text
+    assert "the checkpoint of step 5 could not be saved" in caplog.text
     assert json.loads((run.folder / "status.json").read_text())["state"] == "failed"
 
 
@@ -228,7 +228,7 @@ def test_resume_finishes_what_was_killed_after_the_evaluation(whole: Path, tmp_p
     (copy / "status.json").write_text('{"state": "running", "step": 8}')
     assert state_of(read_run(copy)) == (
         "running",
-        f"under way or killed: 8 of 8 steps, evaluated at step 8, without {gone}",
+        f"running or killed: 8 of 8 steps, evaluated at step 8, without {gone}",
     )
     assert main(["resume", str(copy)]) == 0
     assert (copy / gone).is_file()

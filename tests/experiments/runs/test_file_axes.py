@@ -59,8 +59,8 @@ def test_axes_that_fit_the_scene_are_taken_and_logged(
     write_gaussians(tmp_path / "a.spz", model, spz=SpzForm(axes=written))
     read = in_axes_of(scene, read_splats(tmp_path / "a.spz"))
     torch.testing.assert_close(read.means.float(), model.means, atol=1 / 4096, rtol=0)
-    assert f"axes {written}, which fit the scene (" in caplog.text
-    assert f"axes={other} takes the others" in caplog.text
+    assert f"axes {written} fit the scene (" in caplog.text
+    assert f"axes={other} chooses the others" in caplog.text
 
 
 @pytest.mark.parametrize(("given", "stated"), [("rub", 3), ("auto", 4)])
@@ -84,7 +84,7 @@ def test_what_the_scene_leaves_open_is_taken_as_specified(
     along = replace(scene, points=PointCloud(positions=line, colours=torch.zeros(50, 3, dtype=torch.uint8)))
     write_gaussians(tmp_path / "a.spz", at(line))
     in_axes_of(along, read_splats(tmp_path / "a.spz"))
-    assert "axes rub, as SPZ specifies; file and scene leave them open" in caplog.text
+    assert "axes rub (SPZ standard); file and scene do not decide" in caplog.text
     assert "compare with axes=rdf" in caplog.text
 
 
@@ -147,7 +147,7 @@ def test_photos_decide_where_points_and_views_do_not(
     write_gaussians(tmp_path / "a.spz", bright, spz=SpzForm(axes="rdf"))
     read = in_axes_of(one, read_splats(tmp_path / "a.spz"))
     assert read.means[0, 1].item() == pytest.approx(0.4, abs=1 / 4096)
-    assert "axes rdf, which fit the scene (rub: 100.0% in view, thumbnails" in caplog.text
+    assert "axes rdf fit the scene (rub: 100.0% in view, thumbnails" in caplog.text
 
 
 def test_a_glb_that_would_fit_turned_over_is_named_with_a_remedy_that_works(
@@ -155,7 +155,7 @@ def test_a_glb_that_would_fit_turned_over_is_named_with_a_remedy_that_works(
 ) -> None:
     write_gaussians(tmp_path / "a.glb", to_training_axes(model, "rub"))
     in_axes_of(scene, read_splats(tmp_path / "a.glb"))
-    assert "a.glb: its splats would fit the scene better in axes rub" in caplog.text
+    assert "a.glb: the splats would fit the scene better in axes rub" in caplog.text
     assert "export it with y up" in caplog.text
     assert "axes=" not in caplog.text  # which glTF refuses
 
@@ -166,7 +166,7 @@ def test_a_ply_that_would_fit_turned_over_is_named_and_left(
     turned = to_training_axes(model, "rub")
     write_gaussians(tmp_path / "a.ply", turned)
     assert torch.equal(in_axes_of(scene, read_splats(tmp_path / "a.ply")).means, turned.means)
-    assert "a.ply: its splats would fit the scene better in axes rub" in caplog.text
+    assert "a.ply: the splats would fit the scene better in axes rub" in caplog.text
     assert "try axes=rub" in caplog.text
     caplog.clear()
     write_gaussians(tmp_path / "a.ply", model)
@@ -199,7 +199,7 @@ def test_given_axes_count_for_what_is_trained(model: Gaussians, tmp_path: Path) 
 def test_wrong_axes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"axes is 'up'; choose auto, rub"):
         tiny_settings(tmp_path / "run", "axes=up")
-    with pytest.raises(ConfigError, match="axes=rdf is about a splat file: give init=FILE"):
+    with pytest.raises(ConfigError, match="axes=rdf needs a splat file: give init=FILE"):
         start(tiny_settings(tmp_path / "run", "axes=rdf"), plugins())
 
 
@@ -224,4 +224,4 @@ def test_a_file_is_converted_from_given_axes_into_version_4(
 
 def test_flags_of_spz_for_another_file_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(tmp_path / "run"), str(tmp_path / "a.ply"), "--spz-version", "4"]) == 2
-    assert "version are of .spz files" in capsys.readouterr().err
+    assert "SPZ version are for .spz files" in capsys.readouterr().err

@@ -229,7 +229,7 @@ def test_a_file_of_the_scene_is_evaluated_where_it_is(
         folder = tmp_path / f"of {Path(name).stem}"
         assert main(["eval", str(tmp_path / name), *words, f"folder={folder}"]) == 0
         assert json.loads((folder / "evaluation.json").read_text())["psnr"] == pytest.approx(before, abs=0.01)
-        assert ("taken for coordinates relative to that" in capsys.readouterr().err) is warns
+        assert ("reading positions relative to that" in capsys.readouterr().err) is warns
 
 
 def test_python_draws_a_file_by_cameras_of_the_run(far: tuple[Run, Settings]) -> None:

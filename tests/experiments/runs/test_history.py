@@ -64,8 +64,8 @@ def test_other_files_and_another_source_are_told_and_kept(run: Path, caplog: pyt
     packages = facts(run)["packages"]
     alter(run, source="0123", scene=scene | {"stamp": "other"}, packages=packages | {"torch": "1.0"}, device="a GPU")
     resumed(run)
-    assert "files of the scene are not those that the run began with" in caplog.text
-    assert f"begun by another revision of gsx's source (0123, this is {this})" in caplog.text
+    assert "files of the scene have changed since the run started" in caplog.text
+    assert f"started by another revision of gsx's source (0123, this is {this})" in caplog.text
     assert f"packages.torch={packages['torch']}, before it was 1.0" in caplog.text
     assert facts(run)["source"] == f"0123+{this}"
     (entry,) = facts(run)["history"]
@@ -99,7 +99,7 @@ def test_an_edited_config_is_refused_and_an_override_is_kept(run: Path, caplog: 
     caplog.clear()
     (run / "environment.json").write_text(json.dumps({k: v for k, v in facts(run).items() if k != "history"}))
     resumed(run, "iterations=6", "training.ssim_weight=0.1")
-    assert "the run goes on with iterations=6, before it was 4" in caplog.text
+    assert "continuing with iterations=6, before it was 4" in caplog.text
     changed = facts(run)["history"][0]["changed"]
     assert changed["iterations"] == [4, 6]
     assert changed["training.ssim_weight"] == [0.2, 0.1]
@@ -112,11 +112,11 @@ def test_an_edited_config_is_refused_by_another_source_too(run: Path, caplog: py
     with pytest.raises(InputError, match=r"other options \(config.yaml was edited, or another rev.* --changed"):
         resumed(run)
     (run / "config.yaml").write_text(text.replace("  pixel: sample\n", ""))  # as of a gsx that had no such option
-    with pytest.raises(InputError, match=r"this one reads otherwise: rasterizer\.pixel\)"):
+    with pytest.raises(InputError, match=r"this one reads differently: rasterizer\.pixel\)"):
         resumed(run)
     assert "history" not in facts(run)
     resumed(run, changed=True)
-    assert "the run goes on with other options (config.yaml was edited" in caplog.text
+    assert "continuing with other options (config.yaml was edited" in caplog.text
     (entry,) = facts(run)["history"]
     assert {"source", "rasterizer.pixel"} <= entry["changed"].keys()
 
@@ -134,7 +134,7 @@ def test_without_what_it_began_with_a_run_says_so_and_goes_on(
     resumed(run)
     (said,) = warned(caplog)
     assert "environment.json is missing" in said if content is None else "environment.json" in said
-    assert "is not known; that file is written anew" in said
+    assert "are those of the start; the file is written anew" in said
     now = facts(run)
     assert now["source"] == f"unknown+{began['source']}"
     assert now["scene"] == began["scene"]

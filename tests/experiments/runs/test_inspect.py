@@ -163,7 +163,7 @@ def test_folder_of_scenes_names_them(tmp_path: Path) -> None:
     (tmp_path / "b").mkdir()
     write_transforms(tmp_path / "b", "transforms_train.json", 2)
     (problem,) = labelled(describe(tmp_path, plugins()), "problem")
-    assert "is no scene" in problem
+    assert "is not a scene" in problem
     assert "scenes below it: a (colmap), b (blender)." in problem
 
 
@@ -185,7 +185,7 @@ def test_rubbish_is_described_without_raising(tmp_path: Path, name: str, content
 def test_what_is_no_folder_is_said_to_be_none(tmp_path: Path, name: str) -> None:
     (tmp_path / "file.txt").touch()
     (line,) = describe(tmp_path / name, plugins())
-    assert line == f"problem   '{tmp_path / name}' is no folder: check the name."
+    assert line == f"problem   '{tmp_path / name}' is not a folder: check the name."
 
 
 def test_unexpected_errors_become_problems(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

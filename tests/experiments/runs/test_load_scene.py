@@ -41,8 +41,8 @@ def odd_camera(scene: Scene) -> Scene:
     [
         (lambda scene: vars(scene), r"dict: a loader returns a gsx.core.data.scene.Scene"),
         (lambda scene: replace(scene, train=[]), "without training views"),
-        (odd_camera, "whose camera of 'view2' holds a value that is not finite"),
-        (lambda scene: replace(scene, test=scene.train[3:]), "with 'view3' to train on and to test on"),
+        (odd_camera, "camera value that is not finite, of 'view2'"),
+        (lambda scene: replace(scene, test=scene.train[3:]), "with 'view3' among training and test views"),
         (
             lambda scene: replace(scene, background=torch.full((3,), 255.0)),
             r"background of \[255.0, 255.0, 255.0\]: give",

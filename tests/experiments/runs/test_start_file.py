@@ -133,7 +133,7 @@ def test_the_content_of_the_file_counts_for_what_is_trained(trained: Path, tmp_p
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["backbone=scaffold", "iterations=2"], "backbone=scaffold cannot begin with a splat file"),
+        (["backbone=scaffold", "iterations=2"], "backbone=scaffold cannot start from a splat file"),
         (["backbone=octree_gs3d", "backbone.densification=clone_split", "iterations=2"], "says nothing of levels"),
         (["backbone.sh_degree=1", "iterations=2"], "degree 3, backbone.sh_degree is 1"),
     ],
@@ -180,5 +180,5 @@ def test_words_for_a_file_that_says_it_is_compensated(trained: Path, tmp_path: P
     for word in ("backbone=scaffold", "backbone.filter=mip", "iterations=5", "+experiment=x", "init=scratch"):
         with pytest.raises(ConfigError, match="draws the file as it is"):
             composition_of(tmp_path / "mip.ply", ["scene=demo", word])
-    with pytest.raises(ConfigError, match="needs the photographs"):
+    with pytest.raises(ConfigError, match="needs photos"):
         composition_of(tmp_path / "mip.ply", ["eval.zoom=[1]"])

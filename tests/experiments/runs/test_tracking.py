@@ -131,7 +131,7 @@ def test_a_tracker_that_fails_is_warned_of_once_and_the_run_goes_on(
     assert Heard.events == ["started 0", "step 1 of 1", "step 2 of 2"]
     said = [record.getMessage() for record in caplog.records if record.getMessage().startswith("tracker")]
     assert said == [
-        "tracker heard failed at step 3 (OSError: the disk is full): the run goes on without it",
+        "tracker heard failed at step 3 (OSError: the disk is full): the run continues without it",
         "tracker heard is incomplete from step 3 on; the run folder has everything",
     ]
     assert read_run(tmp_path / "run").status["state"] == "ok"
@@ -167,7 +167,7 @@ def test_a_listener_that_fails_too_does_not_hide_why(tmp_path: Path, caplog: pyt
 
     with pytest.raises(RuntimeError, match="no memory"):
         heard_run(tmp_path / "run", listener=Worse(RuntimeError("no memory")))
-    assert "a listener of the run's failure failed: and no disk" in caplog.text
+    assert "a listener to the run's failure failed: and no disk" in caplog.text
 
 
 def test_a_run_that_never_began_is_not_told(tmp_path: Path) -> None:

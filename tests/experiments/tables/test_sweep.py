@@ -105,7 +105,7 @@ def test_killed_and_started_again_a_table_goes_on_where_it_was(
     assert main(words) == 0
     said = capsys.readouterr().err
     assert "1 runs finished, 1 to train" in said
-    assert "going on with" in said
+    assert "continuing" in said
     assert len(list(tmp_path.glob("outputs/demo/gs3d/*/evaluation.json"))) == 2
     assert not list(tmp_path.glob("outputs/demo/gs3d/*/**/*partial*"))
 
@@ -144,7 +144,7 @@ def test_a_run_by_its_composition_is_finished_resumed_or_judged_anew(
         path.unlink()
     (run / "evaluation.json").unlink()
     assert main(words) == 0
-    assert "going on with" in capsys.readouterr().err
+    assert "continuing" in capsys.readouterr().err
     assert all(torch.equal(value, state[name]) for name, value in final_tensors(run).items())
     for path in (run / "checkpoints").glob("step_*.safetensors"):
         path.write_bytes(b"damaged")
@@ -213,6 +213,6 @@ def test_sigterm_leaves_a_checkpoint_and_its_own_exit_code(begin: Begin, tmp_pat
     begun.send_signal(signal.SIGTERM)
     said = begun.communicate(timeout=60)[1]
     assert begun.returncode == -signal.SIGTERM, said
-    assert re.search(r"stopped at step \d+ by SIGTERM; go on with: gsx resume run\n", said), said
+    assert re.search(r"stopped at step \d+ by SIGTERM; continue with: gsx resume run\n", said), said
     assert list((tmp_path / "run" / "checkpoints").glob("step_*.json"))
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "interrupted"

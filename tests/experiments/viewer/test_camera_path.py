@@ -146,7 +146,7 @@ def test_a_splat_file_is_filmed_along_a_path(tmp_path: Path, capsys: pytest.Capt
     assert capsys.readouterr().err == ""
     write_camera_path(tmp_path / "a.json", replace(path(), fps=path().fps / 2))
     assert main([*words, "--to", str(tmp_path / "to")]) == 0
-    assert "also holds 4 frames from frame_00005.png on, of a longer path" in capsys.readouterr().err
+    assert "also holds 4 frames of a longer path, from frame_00005.png on" in capsys.readouterr().err
     assert main([*words, "--movie", str(tmp_path / "a.gif")]) == 0
     assert (tmp_path / "a.gif").read_bytes()[:3] == b"GIF"
     assert main(["render", str(tmp_path / "a.ply")]) == 2

@@ -126,9 +126,7 @@ def refuse_export(path: Path, spz: SpzForm = SPZ_FORM) -> None:
     if not is_page(path):
         refuse_suffix(path, (PAGE,))
     if spz != SPZ_FORM and suffix_of(path) != ".spz":
-        raise InputError(
-            f"--axes and --spz-version are for .spz files, not for {path}: leave them out, or write model.spz"
-        )
+        raise InputError(f"axes and SPZ version are for .spz files, not for {path}: leave them out, or write model.spz")
 
 
 def page_of(run: Run, gaussians: Gaussians, comments: Sequence[str]) -> str:
