@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,7 +16,6 @@ from torch import Tensor
 from gsx.backbones.gs3d import gs3d
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera
-from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError
 from gsx.core.plugins import load_plugins
 from gsx.core.rasterizer import RasterSettings
@@ -56,25 +56,16 @@ def begun(folder: Path, views: int = 5, steps: int = 20) -> tuple[Run, list[int]
     grey = small_scene(spread(60), extent=4.0, views=views)
     scene = replace(grey, train=[replace(view, source=Told(n, seen)) for n, view in enumerate(grey.train)])
 
-    def anew(scene: Scene, iterations: int, generator: torch.Generator, resolution: TrainingViews) -> Backbone:
-        return gs3d(
-            published_options(),
-            BackboneContext(
-                scene=scene,
-                iterations=iterations,
-                device=torch.device("cpu"),
-                raster=RasterSettings(),
-                generator=generator,
-                views=resolution,
-            ),
-        )
+    def anew(**facts: Any) -> Backbone:
+        context = BackboneContext(device=torch.device("cpu"), raster=RasterSettings(), **facts)
+        return gs3d(published_options(), context)
 
     generator = torch.Generator().manual_seed(0)
     resolution = TrainingViews(scene=scene, modules={"blur": build_module(Blur, BlurOptions(), scene=scene)})
     run = Run(
         config={},
         folder=folder,
-        backbone=anew(scene, 40, generator, resolution),
+        backbone=anew(scene=scene, iterations=40, generator=generator, views=resolution),
         raster=RasterSettings(),
         training=TRAINING,
         iterations=40,
@@ -107,8 +98,8 @@ def test_a_half_sees_its_views_in_one_way(tmp_path: Path) -> None:
     run.modules["blur"].movements = {"view1": (0.1, 0.0)}
     asked = list[TrainingViews]()
 
-    def anew(scene: Scene, iterations: int, generator: torch.Generator, resolution: TrainingViews) -> Backbone:
-        asked.append(resolution)
+    def anew(views: TrainingViews, **others: Any) -> Backbone:
+        asked.append(views)
         return run.backbone
 
     half = half_run(run, anew, 0, 10, 3)

@@ -14,7 +14,6 @@ import torch
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.gaussians.splats import Gaussians
-from gsx.core.rasterizer import RasterSettings
 from gsx.core.training.augmenter import Augmenter, AugmenterContext, Replacing
 from gsx.core.training.backbone import Backbone, BackboneContext, Planned
 from gsx.core.training.distributed import Ranks
@@ -32,13 +31,10 @@ from gsx.engine.threads import watch_cores
 from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.halves import NewBackbone, held_out_renders
 from gsx.experiments.runs.rasterizer_path import decide
-from gsx.experiments.runs.settings import Chosen, Settings
-from gsx.experiments.runs.start_file import in_front_of, one_point, start_from
+from gsx.experiments.runs.settings import Settings
+from gsx.experiments.runs.start_file import go_on_from, in_front_of, one_point
 
 logger = logging.getLogger(__name__)
-
-ALONE = Ranks()
-
 
 # -- device and ranks --------------------------------------------------------------------------------------------------
 
@@ -165,14 +161,19 @@ def build(
     if training:
         refuse_shared(views.modules, ranks)
 
-    new_backbone = partial(backbone_of, settings.backbone, device, raster)
+    chosen = settings.backbone
+    facts: dict[str, Any] = {"scene": scene, "iterations": general.iterations, "device": device}
+    context = BackboneContext(**facts, raster=raster, generator=generator, views=views, ranks=ranks, begins=begins)
+
+    def new_backbone(**changes: Any) -> Backbone:
+        return chosen.component.factory(chosen.options, replace(context, **changes))
+
     if splat_file(general.init):
         stand_in = in_front_of(scene.train[0].camera)
-        one = replace(scene, points=one_point(stand_in))
-        backbone = new_backbone(one, general.iterations, generator, views, ranks, begins=False)
-        go_on_from(backbone, start or stand_in, settings.backbone.component.name)
+        backbone = new_backbone(scene=replace(scene, points=one_point(stand_in)), begins=False)
+        go_on_from(backbone, start or stand_in, chosen.component.name)
     else:
-        backbone = new_backbone(scene, general.iterations, generator, views, ranks, begins)
+        backbone = new_backbone()
     return Run(
         config=settings.resolved,
         folder=folder,
@@ -198,31 +199,6 @@ def build_modules(settings: Settings, scene: Scene, device: torch.device) -> Mod
         )
         for name, chosen in settings.modules.items()
     }
-
-
-def backbone_of(
-    chosen: Chosen,
-    device: torch.device,
-    raster: RasterSettings,
-    scene: Scene,
-    iterations: int,
-    generator: torch.Generator,
-    views: TrainingViews,
-    ranks: Ranks = ALONE,
-    begins: bool = True,
-) -> Backbone:
-    """Build the chosen backbone at step 0; see `BackboneContext`."""
-    context = BackboneContext(
-        scene=scene,
-        iterations=iterations,
-        device=device,
-        raster=raster,
-        generator=generator,
-        views=views,
-        ranks=ranks,
-        begins=begins,
-    )
-    return chosen.component.factory(chosen.options, context)
 
 
 def build_augmenters(settings: Settings, scene: Scene, new_backbone: NewBackbone) -> dict[str, Augmenter]:

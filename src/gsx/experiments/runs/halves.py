@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.resize import to_uint8
-from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError, LostModel, TrainingError
 from gsx.core.files import replace_file
 from gsx.core.plugins import load_plugins
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
 from gsx.core.training.backbone import Backbone
+from gsx.core.training.distributed import Ranks
 from gsx.core.training.photo_cache import PhotoCache
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -33,8 +33,8 @@ from gsx.experiments.runs.guard import Guard
 logger = logging.getLogger(__name__)
 
 HALVES = 2
-NewBackbone: TypeAlias = Callable[[Scene, int, torch.Generator, TrainingViews], Backbone[Any]]
-"""(scene, steps, generator, training views) -> a backbone by the run's options at step 0."""
+NewBackbone: TypeAlias = Callable[..., Backbone[Any]]
+"""Changes of the run's backbone context -> a backbone by the run's options at step 0."""
 
 
 def held_out_renders(run: Run, new_backbone: NewBackbone, share: float, seed: int) -> list[Float[Tensor, "3 h w"]]:
@@ -81,7 +81,8 @@ def half_run(run: Run, new_backbone: NewBackbone, half: int, steps: int, seed: i
         for name, module in run.modules.items()
     }
     training_views = TrainingViews(scene=scene, modules=modules)
-    backbone = new_backbone(scene, steps, generator, training_views)
+    changes = {"scene": scene, "iterations": steps, "generator": generator, "views": training_views}
+    backbone = new_backbone(**changes, ranks=Ranks(), begins=True)
     return Run(
         config=run.config,
         folder=run.folder,
