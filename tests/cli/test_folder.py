@@ -16,7 +16,7 @@ import torch
 from synthetic_colmap import synthesize, write_photos, write_scene
 
 from gsx.builtin import plugins
-from gsx.cli import folder as folders
+from gsx.cli import train as folders
 from gsx.cli.dispatch import main
 from gsx.core.data.images import write_image
 from gsx.core.errors import InputError
@@ -115,7 +115,7 @@ def test_what_is_no_scene_is_told_with_a_remedy(
 
 def test_a_scene_beside_it_makes_no_sense(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(tmp_path), "scene=demo"]) == 2
-    assert "'scene=demo' does not go with it" in capsys.readouterr().err
+    assert "'scene=demo' does not go with the folder" in capsys.readouterr().err
     assert main([str(tmp_path / "none")]) == 2
     assert "Unknown command or path" in capsys.readouterr().err
 

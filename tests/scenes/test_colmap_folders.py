@@ -11,7 +11,7 @@ from refusals import refused
 from synthetic_colmap import colmap_options, shipped, synthesize, write_photos, write_scene
 
 from gsx.builtin import plugins
-from gsx.cli.folder import scene_words
+from gsx.cli.train import scene_words
 from gsx.core.errors import InputError
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.inspect import describe, readable

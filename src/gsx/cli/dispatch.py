@@ -124,15 +124,15 @@ def command(parse: Callable[[list[str]], Any], module: str, function: str) -> Ca
 
 
 TRAIN = command(parsers.parse_train, "train", "train")
-TRAIN_FOLDER = command(parsers.parse_folder, "folder", "train_folder")
+TRAIN_FOLDER = command(parsers.parse_folder, "train", "train_folder")
 VERBS = {
     "resume": command(parsers.parse_resume, "train", "resume"),
     "eval": command(parsers.parse_eval, "runs", "evaluate"),
     "photographs": command(parsers.parse_photographs, "runs", "check_photographs"),
     "render": command(parsers.parse_render, "runs", "render"),
     "view": command(parsers.parse_view, "runs", "view"),
-    "export": command(parsers.parse_export, "files", "export_file"),
-    "compact": command(parsers.parse_compact, "files", "compact_model"),
+    "export": command(parsers.parse_export, "runs", "export_file"),
+    "compact": command(parsers.parse_compact, "runs", "compact_model"),
     "report": command(parsers.parse_report, "facts", "report"),
     "scenes": command(parsers.parse_scenes, "facts", "check_scene"),
     "datasets": command(parsers.parse_datasets, "facts", "list_datasets"),

@@ -3,6 +3,7 @@
 import logging
 import sys
 from argparse import Namespace
+from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -10,8 +11,9 @@ from typing import Any
 
 from gsx.builtin import plugins
 from gsx.cli.exit_codes import report_error
-from gsx.core.errors import ConfigError, GsxError, InputError
-from gsx.core.files import read_json, write_json
+from gsx.core.errors import ConfigError, GsxError, InputError, command
+from gsx.core.files import at_home, read_json, write_json
+from gsx.core.plugins import Plugins
 from gsx.engine.cache import in_use
 from gsx.engine.processes import say, speaks
 from gsx.engine.signals import INTERRUPTED
@@ -21,13 +23,15 @@ from gsx.experiments.run_folder.files import read_run, reported, state_of
 from gsx.experiments.runs import job
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.history import record_changes
+from gsx.experiments.runs.inspect import scene_loaders
 from gsx.experiments.runs.launched import ended_from_without, is_launched, waiting_for_all
 from gsx.experiments.runs.logs import set_up_logging
 from gsx.experiments.runs.multirun import check_overrides, hydra_main, job_place, launch
 from gsx.experiments.runs.open import open_run, refuse_other, stamped_folder
-from gsx.experiments.runs.overrides import quoted, with_quoted_paths
+from gsx.experiments.runs.overrides import quoted, with_quoted_paths, word_of
 from gsx.experiments.runs.saved_settings import write_config
 from gsx.experiments.runs.settings import settings_from
+from gsx.experiments.runs.video import is_video, photos_of
 from gsx.experiments.tables.sweep import is_table, run_table
 
 logger = logging.getLogger("gsx.cli")
@@ -157,3 +161,28 @@ def resume(options: Namespace) -> int:
             write_config(folder / "config.yaml", settings.resolved)
         logger.info("resuming %s at step %d", folder, run.step)
         return print_report(job.carry_out(run, settings, loaded), folder)
+
+
+def train_folder(arguments: list[str]) -> int:
+    """Train from a folder or a video (first word) with the overrides after it."""
+    path, overrides = at_home(arguments[0]), arguments[1:]
+    words = scene_words(path, overrides, plugins())
+    scene = words[0].partition("=")[2]
+    kind = "a video" if path.is_file() and scene == "photos" else f"read as scene={scene}"
+    logger.info("%s is %s", path, kind)
+    logger.info("%s", command(*words, *overrides))
+    return train([*words, *overrides])
+
+
+def scene_words(path: Path, overrides: Sequence[str], loaded: Plugins) -> list[str]:
+    """Return the overrides that choose the scene of a folder or a video.
+
+    Raises:
+        InputError: it is neither; for a splat file the message lists the commands that take it.
+    """
+    if is_video(path):
+        output = next((word.partition("=")[2] for word in overrides if word.startswith("output=")), "outputs")
+        return ["scene=photos", word_of("scene.path", str(photos_of(path, Path(output))))]
+    loader, its = scene_loaders(path, loaded)[0]
+    more = [word_of(f"scene.{key}", value) for key, value in its.overrides(path).items()]
+    return [f"scene={loader.name}", word_of("scene.path", str(path)), *more]

@@ -140,7 +140,7 @@ def test_views_that_share_little_are_named():
     line = coverage_line(views, seen)
     assert "c.jpg (20%, with a.jpg)" in line
     assert "a.jpg (" not in line
-    assert "100% of fewer than 3" in line
+    assert "100% in fewer than 3" in line
 
 
 def around(degrees):

@@ -9,11 +9,11 @@ import torch
 from foreign_splats import files_of, section, splat, unpacked, version_2, zipped
 from foreign_splats import header as header_of
 from foreign_splats import row as row_of
-from gsx.cli.compact import compact_folder
 from tiny import tiny_settings
 
 import gsx.api
 from gsx.cli.dispatch import main
+from gsx.cli.runs import compact_folder
 from gsx.experiments.run_folder.run_key import scene_stamp
 from gsx.formats.splat_files import compensated, read_gaussians, write_gaussians
 from gsx.formats.suffixes import META, READABLE, SUFFIXES, suffix_of

@@ -137,7 +137,7 @@ def test_renders_are_kept_for_a_resumed_run_and_made_alike_without_the_file(
     assert not seen
     file.write_bytes(b"nothing")
     assert all(torch.equal(a, b) for a, b in zip(first, held_out(0.2, 3), strict=True))
-    assert "made again" in caplog.text
+    assert "rendering again" in caplog.text
     run.step = 30
     held_out(0.2, 3)
     assert [path.name for path in file.parent.glob("halves_*")] == ["halves_0000030_6.safetensors"]

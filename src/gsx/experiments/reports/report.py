@@ -21,8 +21,16 @@ from gsx.experiments.reports.charts import Mark, Series, line_chart, smoothed
 from gsx.experiments.reports.overview import common_folder, runs_in, write_overview
 from gsx.experiments.reports.page import template, time_unit
 from gsx.experiments.reports.pictures import ERROR_COLOURS
-from gsx.experiments.run_folder.files import DETAIL_OF, RunFiles, detail_share, gain_of, part, read_run, state_of
-from gsx.experiments.run_folder.integrity import newest_checkpoint
+from gsx.experiments.run_folder.files import (
+    DETAIL_OF,
+    RunFiles,
+    detail_share,
+    gain_of,
+    newest_checkpoint,
+    part,
+    read_run,
+    state_of,
+)
 from gsx.experiments.run_folder.shapes import is_number
 
 WORST = 10

@@ -7,12 +7,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from gsx.core.errors import command, first_line
+from gsx.core.errors import InputError, command, first_line
 from gsx.core.files import is_file, read_json
 from gsx.experiments.run_folder import shapes
-from gsx.experiments.run_folder.integrity import checkpoint_problem, newest_checkpoint, splats_problem
 from gsx.experiments.run_folder.renamed import renamed
 from gsx.experiments.run_folder.shapes import fits, is_number
+from gsx.formats.detect import MOST_HEADER
+from gsx.formats.ply import length_of
 from gsx.formats.suffixes import suffix_of
 
 DETAIL_OF = ("render", "enlarged", "photograph")
@@ -310,3 +311,43 @@ def reported(folder: Path) -> bool:
         return (folder / REPORT).stat().st_mtime_ns >= (folder / "status.json").stat().st_mtime_ns
     except OSError:
         return False
+
+
+def splats_problem(path: Path) -> str:
+    """Describe what is wrong with a splat file by its header; empty: nothing."""
+    try:
+        with path.open("rb") as stream:
+            length = length_of(stream.read(MOST_HEADER))
+        size = path.stat().st_size
+    except (OSError, InputError) as error:
+        return f"{path.name} cannot be read ({error})"
+    return "" if size == length else f"{path.name} has {size:,} bytes, its header says {length:,}"
+
+
+def newest_checkpoint(folder: Path) -> int:
+    """Return the step of a run's newest checkpoint; -1: it has none."""
+    from gsx.core.training.checkpoint_files import sidecars, step_of
+
+    return max(map(step_of, sidecars(folder / "checkpoints")), default=-1)
+
+
+def checkpoint_problem(folder: Path) -> str:
+    """Describe what is wrong with a run's newest checkpoint by its sidecar and header; empty: nothing, or none."""
+    from safetensors import SafetensorError, safe_open
+
+    from gsx.core.training.checkpoint_files import sidecars, step_of
+    from gsx.experiments.run_folder.checkpoint import is_valid
+
+    for sidecar in sidecars(folder / "checkpoints")[-1:]:
+        tensors = sidecar.with_suffix(".safetensors")
+        try:
+            meta = read_json(sidecar)
+            with safe_open(tensors, "numpy"):  # compares the file's size with its header
+                pass
+        except FileNotFoundError:
+            return ""
+        except (OSError, ValueError, SafetensorError) as error:
+            return f"checkpoint {tensors.name} cannot be read ({error})"
+        if not (isinstance(meta, dict) and is_valid(meta, step_of(sidecar))):
+            return f"checkpoint {sidecar.name} is not what gsx writes"
+    return ""

@@ -1,6 +1,7 @@
 """A composed experiment: a component and its typed options for each group. No Hydra here."""
 
 import dataclasses
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from typing import Annotated, Any
@@ -15,11 +16,11 @@ from gsx.core.options import fields_with
 from gsx.core.plugins import Component, Plugins
 from gsx.core.ranges import Range, Share
 from gsx.core.rasterizer import RasterOptions, RasterSettings
+from gsx.core.rasterizer.compositor import Compositor
 from gsx.core.training.regenerator import NamesCode
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
-from gsx.experiments.runs.plugin_compositors import with_compositors
 from gsx.experiments.runs.typed import schema_keys, texts, typed, unknown_key
 from gsx.formats.suffixes import splat_file_at, suffix_of
 
@@ -246,3 +247,34 @@ def strict_node() -> Any:
 def strict_checks() -> Checks:
     """Return the checks of regenerators that promise consistency, which are the default."""
     return typed(Checks, OmegaConf.to_container(strict_node()), "checks")
+
+
+class Compositors(Mapping[str, Compositor]):
+    """Compositors by name, each built at its first use."""
+
+    def __init__(self, components: Mapping[str, Component]) -> None:
+        self.components = components
+        self.built: dict[str, Compositor] = {}
+
+    def __getitem__(self, name: str) -> Compositor:
+        if name not in self.built:
+            component = self.components[name]
+            self.built[name] = component.factory(component.options())
+        return self.built[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.components
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.components)
+
+    def __len__(self) -> int:
+        return len(self.components)
+
+
+def with_compositors(options: RasterOptions, plugins: Plugins) -> RasterSettings:
+    """Return settings whose path may name any registered compositor; raise ConfigError if it names none."""
+    try:
+        return RasterSettings(**vars(options), compositors=Compositors(plugins.registry.of("compositor")))
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
