@@ -63,7 +63,9 @@ def test_a_run_is_no_scene(tmp_path: Path) -> None:
     (folder / "config.yaml").write_text("")
     assert not any("is a run" in line for line in describe(folder, plugins())), "others have such files, too"
     (folder / "environment.json").write_text("")
-    told = f"{folder} is a run, not a scene. Use it with gsx view '{folder}', gsx eval '{folder}', gsx resume '{folder}'"
+    told = (
+        f"{folder} is a run, not a scene. Use it with gsx view '{folder}', gsx eval '{folder}', gsx resume '{folder}'"
+    )
     assert describe(folder, plugins()) == [f"problem   {told}"]
 
 
