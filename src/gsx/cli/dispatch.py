@@ -10,7 +10,7 @@ from gsx import __version__
 from gsx.cli import arguments as parsers
 from gsx.cli.exit_codes import discard_unwritten, report_closed_output, report_error
 from gsx.core.errors import ConfigError, nearest
-from gsx.core.files import at_home
+from gsx.core.files import expand_home
 from gsx.engine.collector import loading
 from gsx.engine.processes import processes
 from gsx.experiments.runs.logs import set_up_logging
@@ -106,7 +106,7 @@ def dispatch(arguments: list[str]) -> int:
         return VERBS[first](arguments[1:])
     if first == "trade":
         raise ConfigError(TRADE_MOVED)
-    if at_home(first).exists():
+    if expand_home(first).exists():
         return TRAIN_FOLDER(arguments)
     raise ConfigError(f"Unknown command or path '{first}'.{nearest(first, VERBS)} See gsx --help")
 

@@ -12,7 +12,7 @@ from typing import Any
 from gsx.builtin import plugins
 from gsx.cli.exit_codes import report_error
 from gsx.core.errors import ConfigError, GsxError, InputError, command
-from gsx.core.files import at_home, read_json, write_json
+from gsx.core.files import expand_home, read_json, write_json
 from gsx.core.plugins import Plugins
 from gsx.engine.cache import in_use
 from gsx.engine.processes import say, speaks
@@ -165,7 +165,7 @@ def resume(options: Namespace) -> int:
 
 def train_folder(arguments: list[str]) -> int:
     """Train from a folder or a video (first word) with the overrides after it."""
-    path, overrides = at_home(arguments[0]), arguments[1:]
+    path, overrides = expand_home(arguments[0]), arguments[1:]
     words = scene_words(path, overrides, plugins())
     scene = words[0].partition("=")[2]
     kind = "a video" if path.is_file() and scene == "photos" else f"read as scene={scene}"

@@ -303,7 +303,7 @@ def test_a_damaged_photograph_is_told_before_a_folder_exists(
 )
 def test_a_sidecar_with_numbers_of_no_step_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
     """The digest is that of the tensors: numbers beside it are looked at by themselves."""
-    from gsx.core.training.checkpoint_files import step_of
+    from gsx.core.files import step_of
     from gsx.experiments.run_folder.checkpoint import is_valid
 
     sidecar = tmp_path / "step_0000004.json"

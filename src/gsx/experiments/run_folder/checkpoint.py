@@ -54,7 +54,7 @@ def write(run: Run, folder: Path) -> Path:
         "step": run.step,
         "seconds": run.progress.seconds,
         "sampler": run.sampler.order,
-        "orders": run.sampler.begun,
+        "orders": run.sampler.orders,
         "views": view_names(run),
         "origin": run.scene.origin,
         "sha256": hashlib.sha256(data).hexdigest(),
@@ -165,10 +165,10 @@ def restore(run: Run, training: bool = False) -> None:
         raise CheckpointError(f"a checkpoint of {run.folder} has no random state ({error})") from error
     for prefix, module in run.modules.items():
         module.load_state_dict(pop_prefixed(tensors, f"{prefix}."))
-    run.backbone.table = restored_table(run.backbone.table, tensors)
+    run.backbone.table = restore_table(run.backbone.table, tensors)
     run.step, run.progress.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])
-    run.sampler.begun = meta.get("orders", -(-run.step // run.sampler.count))  # older runs do not count orders
+    run.sampler.orders = meta.get("orders", -(-run.step // run.sampler.count))  # older runs do not count orders
     for sidecar in damaged if training and run.ranks.first else ():
         sidecar.rename(sidecar.with_suffix(".damaged"))
 

@@ -326,7 +326,7 @@ def splats_problem(path: Path) -> str:
 
 def newest_checkpoint(folder: Path) -> int:
     """Return the step of a run's newest checkpoint; -1: it has none."""
-    from gsx.core.training.checkpoint_files import sidecars, step_of
+    from gsx.core.files import sidecars, step_of
 
     return max(map(step_of, sidecars(folder / "checkpoints")), default=-1)
 
@@ -335,7 +335,7 @@ def checkpoint_problem(folder: Path) -> str:
     """Describe what is wrong with a run's newest checkpoint by its sidecar and header; empty: nothing, or none."""
     from safetensors import SafetensorError, safe_open
 
-    from gsx.core.training.checkpoint_files import sidecars, step_of
+    from gsx.core.files import sidecars, step_of
     from gsx.experiments.run_folder.checkpoint import is_valid
 
     for sidecar in sidecars(folder / "checkpoints")[-1:]:

@@ -32,7 +32,7 @@ from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.halves import NewBackbone, held_out_renders
 from gsx.experiments.runs.rasterizer_path import decide
 from gsx.experiments.runs.settings import Settings
-from gsx.experiments.runs.start_file import go_on_from, in_front_of, one_point
+from gsx.experiments.runs.start_file import in_front_of, one_point, start_from
 
 logger = logging.getLogger(__name__)
 
@@ -171,7 +171,7 @@ def build(
     if splat_file(general.init):
         stand_in = in_front_of(scene.train[0].camera)
         backbone = new_backbone(scene=replace(scene, points=one_point(stand_in)), begins=False)
-        go_on_from(backbone, start or stand_in, chosen.component.name)
+        start_from(backbone, start or stand_in, chosen.component.name)
     else:
         backbone = new_backbone()
     return Run(

@@ -80,7 +80,7 @@ class Agreement:
 
 def digest(run: Run) -> str:
     """Return a digest of all that the next steps depend on."""
-    content = hashlib.sha256(repr((run.sampler.order, run.sampler.begun)).encode())
+    content = hashlib.sha256(repr((run.sampler.order, run.sampler.orders)).encode())
     for name, value in sorted({"generator": run.generator.get_state(), **table_tensors(run.backbone.table)}.items()):
         content.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
     return content.hexdigest()

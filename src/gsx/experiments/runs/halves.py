@@ -63,7 +63,7 @@ def render_halves(run: Run, new_backbone: NewBackbone, steps: int, seed: int) ->
     started, views = time.perf_counter(), run.train_views
     renders: dict[int, Tensor] = {}
     for half in range(HALVES):
-        model = trained(half_run(run, new_backbone, half, steps, seed), run.refuse_if_stopping)
+        model = trained(half_run(run, new_backbone, half, steps, seed), run.raise_if_stopping)
         numbers = range(half, len(views), HALVES)
         renders |= {n: to_uint8(run.as_photo(render(model, views[n].camera).image, views[n])) for n in numbers}
     logger.info("both models have rendered their held-out half, %.0f s", time.perf_counter() - started)
@@ -97,8 +97,8 @@ def half_run(run: Run, new_backbone: NewBackbone, half: int, steps: int, seed: i
     )
 
 
-def trained(run: Run, refuse_if_stopping: Callable[[], None]) -> Run:
-    """Train to the end with the guard as only listener; `refuse_if_stopping`: of the run that it is trained for.
+def trained(run: Run, raise_if_stopping: Callable[[], None]) -> Run:
+    """Train to the end with the guard as only listener; `raise_if_stopping`: of the run that it is trained for.
 
     Raises:
         TrainingError: this model was lost; that run is not.

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gsx.core.data.scene import Scene
 from gsx.core.errors import CheckpointError, ConfigError, InputError, command
-from gsx.core.files import keep_names, read_json, remove_partial, write_json
+from gsx.core.files import read_json, remove_partial, sync_folder, write_json
 from gsx.core.packages import require
 from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterSettings
@@ -68,7 +68,7 @@ def new_folder(settings: Settings, scene: Scene) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     else:
         folder = stamped_folder(Path(settings.general.output) / scene.name / settings.backbone.component.name)
-    keep_names(folder.parent)
+    sync_folder(folder.parent)
     return folder
 
 

@@ -82,7 +82,7 @@ def finding(run: Run, view: View, known_sharpness: float | None, pixels: int) ->
     """Compare one photo with its render; without remarks."""
     plain, photo, counted = render(run, view.camera, pixels).image, view.image(), view.counted()
     image = as_photo(run, view, plain)
-    error = blacked(image - photo, counted).square().mean(0)
+    error = black_out(image - photo, counted).square().mean(0)
     return Finding(
         name=view.name,
         psnr=psnr(image, photo, counted),

@@ -92,7 +92,7 @@ def start_doubts(settings: Settings, scene: Scene, start: Gaussians | None) -> l
     return [*doubts, f"{path.name}: {BLENDS}"] if is_linear(path) else doubts
 
 
-def go_on_from(backbone: Backbone[Any], gaussians: Gaussians, name: str) -> None:
+def start_from(backbone: Backbone[Any], gaussians: Gaussians, name: str) -> None:
     """Replace a backbone's primitives by Gaussians.
 
     Raises:
@@ -101,7 +101,7 @@ def go_on_from(backbone: Backbone[Any], gaussians: Gaussians, name: str) -> None
     """
     if not isinstance(backbone, FromGaussians):
         raise ConfigError(f"backbone={name} cannot start from a splat file: choose backbone=gs3d, or leave out init")
-    backbone.go_on_from(gaussians)
+    backbone.start_from(gaussians)
 
 
 def in_front_of(camera: Camera) -> Gaussians:
