@@ -1,107 +1,72 @@
-"""Hooks of mkdocs: the index is README.md, the page of the configuration is made from conf/."""
+"""Hooks of mkdocs: the index is README.md; pages of reference and of results are generated."""
 
 import os
 import re
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from api_page import api_page
+from cli_page import cli_page
+from configuration_page import reference
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 from gsx.builtin import plugins
-from gsx.core.errors import ConfigError
-from gsx.core.plugins import Plugins
-from gsx.experiments.runs.compose import Compositions, known_groups, listed
-from gsx.experiments.runs.explain import comment_on, head_of, kind_of, parsed, value_at, written
-from gsx.experiments.runs.typed import dotted
 
 ROOT = Path(__file__).parents[1]
-SEVERAL = {"augmenter": "augmenter", "tracker": "tracker", "module": "training"}
-"""Keys of the options of groups of which several are chosen."""
-LISTED = ("scene", "backbone", *SEVERAL, "regenerator/upscale", "regenerator/restore", "rasterizer")
-"""Groups whose options have keys of their own; presets and variants set those of others."""
+RESULTS = ROOT / "benchmarks" / "results"
+"""Tables and plots that benchmarks write; the site has them in its folder `benchmarks`."""
 
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages that lie elsewhere or nowhere."""
-    files.append(File.generated(config, "index.md", content=index()))
-    files.append(File.generated(config, "reference/configuration.md", content="\n".join(reference(plugins()))))
+    pages = {
+        "index.md": index(),
+        "reference/configuration.md": "\n".join(reference(plugins())),
+        "reference/cli.md": cli_page(),
+        "reference/api.md": api_page(),
+    }
+    for name, content in pages.items():
+        files.append(File.generated(config, name, content=content))
+    for file in sorted(RESULTS.rglob("*")):
+        if file.suffix in (".md", ".svg"):
+            files.append(File.generated(config, result_page(file), content=file.read_text(encoding="utf-8")))
     return files
 
 
+def result_page(file: Path) -> str:
+    """Return where the site has a file of benchmarks/results."""
+    return f"benchmarks/{file.relative_to(RESULTS).as_posix()}"
+
+
 def index() -> str:
-    """README.md with its links as seen from docs/."""
+    """Return README.md with its links as they are from docs/."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     return re.sub(r"\]\((?!https?:|#)(?:docs/)?", "](", re.sub(r"\]\((?!docs/|https?:|#)", "](../", text))
 
 
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
-    """Name files outside of docs/, which the site does not hold: [text](../../file) becomes text (`file`)."""
+    """Rewrite links that lead out of docs/: to pages of results, or to the name of the file in backticks."""
     folder = (ROOT / "docs" / page.file.src_uri).parent
-    return re.sub(r"!?\[([^\]]*)\]\(((?:\.\./)+[^)]+)\)", partial(in_words, folder), markdown)
+    return re.sub(r"!?\[([^\]]*)\]\(((?:\.\./)+[^)]+)\)", partial(rewritten, folder), markdown)
 
 
-def in_words(folder: Path, link: re.Match[str]) -> str:
-    """Replace a link to a file of the repository outside of docs/ by words; keep others.
+def rewritten(folder: Path, link: re.Match[str]) -> str:
+    """Return a link as the site needs it: pages of docs/ as they are, results by their page, other files in words.
 
     Raises:
         ValueError: there is no such file.
     """
     text, target = link.groups()
-    file = Path(os.path.normpath(folder / target.partition("#")[0]))
+    name, mark, anchor = target.partition("#")
+    file = Path(os.path.normpath(folder / name))
     if file.is_relative_to(ROOT / "docs"):
         return link[0]
     if not file.exists():
         raise ValueError(f"'{target}' is no file of the repository")
-    name = str(file.relative_to(ROOT))
-    return f"`{name}`" if text.strip("`") in name else f"{text} (`{name}`)"
-
-
-# -- the configuration ---------------------------------------------------------------------------------------------
-
-
-def reference(plugins: Plugins) -> list[str]:
-    """Return a page over all keys in Markdown: of a run, then of each option of each group."""
-    lines = [
-        "# Configuration",
-        "",
-        "Every key with its value, its type and range, and its comment. On the command line:",
-        "`gsx KEY=VALUE`, `gsx GROUP=OPTION`, `gsx explain KEY`.",
-    ]
-    with Compositions(plugins) as compositions:
-        groups = [group for group in known_groups() if listed(group)]
-        lines += ["", "## Of a run", "", *keys_table("", [], compositions, groups)]
-        for group in filter(LISTED.__contains__, groups):
-            for option in listed(group):
-                word = f"{group}=[{option}]" if group in SEVERAL else f"{group}={option}"
-                lines += ["", f"## {word}", "", head_of(compositions.file(f"{group}/{option}")) + ".", ""]
-                prefix = f"{SEVERAL[group]}.{option}" if group in SEVERAL else group.replace("/", ".")
-                lines += keys_table(prefix, [word], compositions, groups)
-    return [*lines, ""]
-
-
-def keys_table(prefix: str, words: Sequence[str], compositions: Compositions, groups: Sequence[str]) -> list[str]:
-    """Return a row for each key below a prefix; without one, for those of a run that are in no group."""
-    values = compositions.values(words)
-    try:
-        settings = compositions.settings(words)
-    except ConfigError:  # an option that needs more, for example a model
-        settings = None
-    files = parsed(compositions.sources(words))
-    of_groups = tuple(f"{group.partition('/')[0]}." for group in groups)
-    rows = ["| key | value | type | |", "|---|---|---|---|"]
-    for key in dotted(values):
-        node = value_at(key, values)
-        belongs = key.startswith(f"{prefix}.") if prefix else not key.startswith(of_groups)
-        if belongs and not isinstance(node, dict):
-            kind = kind_of(key, settings) if settings else ""
-            cells = (f"`{key}`", f"`{written(node)}`", kind, comment_on(key, files))
-            rows.append("| " + " | ".join(map(in_cell, cells)) + " |")
-    return rows
-
-
-def in_cell(text: str) -> str:
-    """Return a text for a cell of a table, with its marks escaped."""
-    return re.sub(r"([|*])", r"\\\1", text) if "`" in text else re.sub(r"([|*_<>])", r"\\\1", text)
+    if file.is_relative_to(RESULTS) and file.suffix in (".md", ".svg"):
+        page = os.path.relpath(ROOT / "docs" / result_page(file), folder)
+        return link[0].replace(f"({target})", f"({page}{mark}{anchor})")
+    path = str(file.relative_to(ROOT))
+    return f"`{path}`" if text.strip("`") in path else f"{text} (`{path}`)"

@@ -3,6 +3,7 @@
 import inspect
 import os
 import re
+import shlex
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -99,8 +100,8 @@ def test_commands_of_pages_are_accepted(page: Path) -> None:
     blocks = re.findall(r"```sh\n(.*?)```", page.read_text(), re.S)
     commands = [line.split("#")[0].strip() for block in blocks for line in block.splitlines() if line.startswith("gsx")]
     for command in commands:
-        words = [word.strip("'") for word in command.split()[1:]]
-        if words and words[0] in (*VERBS, "FOLDER"):  # what stands for a path is told when it is given
+        words = shlex.split(command)[1:]
+        if words and words[0] in (*VERBS, "FOLDER", "VIDEO"):  # placeholders of paths
             continue
         if not any(word.startswith("-") for word in words):
             composed(tuple(word for word in words if word != "init=FILE"))

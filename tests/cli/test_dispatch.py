@@ -59,6 +59,13 @@ def test_plugins_lists_builtins(capsys: pytest.CaptureFixture[str]) -> None:
     assert "gs3d (gsx)" in out
 
 
+def test_datasets_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["datasets", f"data_root={tmp_path}"]) == 0
+    out = capsys.readouterr().out
+    assert "demo: built-in scene, 1 of 1 scenes found" in out
+    assert "mipnerf360: Mip-NeRF360, 0 of 9 scenes found" in out
+
+
 def test_train_prints_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words(tmp_path / "run", *FEW, "iterations=2")) == 0
     captured = capsys.readouterr()

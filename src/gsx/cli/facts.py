@@ -38,7 +38,7 @@ def list_datasets(options: Namespace) -> int:
     """Print the folders of datasets that are there and those that are missing."""
     overrides = [word for word in options.words if "=" in word]
     with Compositions(plugins()) as compositions:
-        known = [name for name in listed("dataset") if name != "own"]
+        known = [name for name in listed("dataset") if name not in ("none", "own")]  # they name no scenes
         for name in [word for word in options.words if "=" not in word] or known:
             if name not in known:
                 raise InputError(f"Unknown dataset '{name}'. Choose from {', '.join(known)}.{nearest(name, known)}")
