@@ -34,7 +34,6 @@ MODULES = {
         "gsx.core.gaussians.quaternions",
         "gsx.core.rasterizer.settings",
         "gsx.core.rasterizer.render",
-        "gsx.core.rasterizer.tiled",
         "gsx.core.rasterizer.compositor",
         "gsx.core.backend",
     ),
