@@ -6,19 +6,19 @@ from unittest.mock import patch
 
 import torch
 
-from gsx.engine.compile_cache import KeptFunction
+from gsx.engine.compile_cache import CachedFunction
 
 
 @contextmanager
 def new_code() -> Iterator[list[str]]:
     """Names of the functions for which code is made or loaded from now on, by whichever way."""
-    names, find = list[str](), KeptFunction.find
+    names, find = list[str](), CachedFunction.find
 
-    def found(self: KeptFunction, *given: object) -> object:
+    def found(self: CachedFunction, *given: object) -> object:
         names.append(self.function.__name__)
         return find(self, *given)
 
     graphs = torch._dynamo.utils.counters["stats"]["unique_graphs"]
-    with patch.object(KeptFunction, "find", found):
+    with patch.object(CachedFunction, "find", found):
         yield names
     names += ["of torch"] * (torch._dynamo.utils.counters["stats"]["unique_graphs"] - graphs)

@@ -663,14 +663,14 @@ def test_a_stage_is_slower_beyond_a_tenth_and_half_a_millisecond() -> None:
 @pytest.mark.skipif(not compiled.available(), reason="no working compiler on this machine")
 def test_loops_are_timed_by_the_names_they_have(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsx.engine.lanes.chunks_at_most", lambda lengths, chunk: 1)
-    settings, own = replace(settings_of("compiled"), unrolled=2), compiled.kernels
+    settings, own = replace(settings_of("compiled"), unrolled=2), compiled.compiled_loop
     screen = learnable(project(splats_of(CASE, CPU), camera_of(CASE), settings))
     with loops_timed() as spent:
         picture, _ = blend_screen(screen, camera_of(CASE), settings)
         picture.sum().backward()
     assert set(spent) == {name for names in LOOPS.values() for name in names}
     assert min(spent.values()) > 0
-    assert compiled.kernels is own
+    assert compiled.compiled_loop is own
 
 
 def test_least_times_of_stages_by_hand() -> None:

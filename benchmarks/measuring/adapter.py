@@ -1,8 +1,8 @@
 """All that the benchmarks know of the rasterizer's inside. When pairing or blending change shape, mend it here."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from gsx.core.rasterizer.projection import ScreenSplats
 from gsx.core.shapes import Float
 from gsx.engine import compiled
 from gsx.engine.compositors import COMPOSITORS
-from gsx.engine.kernels import Kernels, Rules
+from gsx.engine.kernels import Rules
 from gsx.experiments.runs.compose import compose
 from measuring.stages import StageClock
 
@@ -69,18 +69,17 @@ def blend_screen(
 @contextmanager
 def loops_timed() -> Iterator[dict[str, float]]:
     """Yields the seconds spent in each compiled loop over blocks since the context began, by name."""
-    clock, kernels = StageClock(), compiled.kernels
+    clock, own = StageClock(), compiled.compiled_loop
 
-    def clocked(rules: Rules) -> Kernels:
-        loops = kernels(rules)
-        names = ("transmit", "blend", "gradients")
-        return replace(loops, **{name: clock.clocked(name, getattr(loops, name)) for name in names})
+    def clocked(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
+        name, run = loop.__name__, own(loop, rules)
+        return clock.clocked(name, run) if name in ("transmit", "blend", "gradients") else run
 
-    compiled.kernels = clocked  # type: ignore[assignment]
+    compiled.compiled_loop = clocked
     try:
         yield clock.seconds
     finally:
-        compiled.kernels = kernels
+        compiled.compiled_loop = own
 
 
 def to_raster(tiles: Float[Tensor, "T P C"], camera: Camera, tile: int) -> Float[Tensor, "C H W"]:

@@ -18,7 +18,7 @@ from gsx.builtin import plugins
 from gsx.core.training.trainer import train_step
 from gsx.engine import compile_ahead
 from gsx.engine.compile_ahead import Step, end, help_compiling, helper, needed
-from gsx.engine.compile_cache import Call, KeptFunction, file_of, recorded
+from gsx.engine.compile_cache import CachedFunction, Call, file_of, recorded
 from gsx.engine.compiling import available
 from gsx.experiments.runs.open import start
 from gsx.experiments.runs.rasterizer_path import warm
@@ -31,7 +31,7 @@ def compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets a compiler work where calls are only recorded; its code would lie in a folder of the test."""
     monkeypatch.setattr("gsx.engine.backend.available", lambda _: True)
     monkeypatch.setattr("gsx.engine.compiled.available", lambda _: True)
-    monkeypatch.setattr("gsx.engine.compile_cache.place", lambda: tmp_path / "functions")
+    monkeypatch.setattr("gsx.engine.compile_cache.functions_folder", lambda: tmp_path / "functions")
 
 
 def files_of(calls: list[Call]) -> dict[Path, str]:
@@ -92,7 +92,7 @@ class Begun:
 def test_the_helper_compiles_the_same_calls_from_the_other_end(monkeypatch: pytest.MonkeyPatch) -> None:
     made, begun = list[Path](), list[Begun]()
     platform.processor()  # starts a process of its own the first time
-    monkeypatch.setattr(KeptFunction, "make", lambda self, file, arguments: (made.append(file), file.touch()))
+    monkeypatch.setattr(CachedFunction, "make", lambda self, file, arguments: (made.append(file), file.touch()))
     monkeypatch.setattr("subprocess.Popen", lambda words, **_: begun.append(Begun(words)) or begun[-1])
     monkeypatch.setattr("torch.get_num_threads", lambda: 2)
     monkeypatch.setattr("torch.set_num_threads", lambda _: None)
@@ -117,8 +117,8 @@ def test_help_is_for_several_functions_and_threads(
     monkeypatch.setattr("subprocess.Popen", lambda words, **_: begun.append(json.loads(words[-1])) or Begun(words))
     monkeypatch.setattr("torch.get_num_threads", lambda: threads)
     monkeypatch.setattr(compile_ahead, "needed", lambda *_: [])
-    monkeypatch.setattr(compile_ahead, "lacking", lambda _: range(missing))
-    monkeypatch.setattr(compile_ahead, "place", lambda: tmp_path)
+    monkeypatch.setattr(compile_ahead, "uncached", lambda _: range(missing))
+    monkeypatch.setattr(compile_ahead, "functions_folder", lambda: tmp_path)
     monkeypatch.setattr(compile_ahead, "draw_one", lambda *_: None)
     compile_ahead.compile_ahead(Step(settings=any_path(), sh_degree=3), CPU, helped)
     assert [words["sh_degree"] for words in begun] == ([3] if begins else [])

@@ -25,13 +25,13 @@ from gsx.engine.backend import COMPILED, compiled_kernel
 from gsx.engine.cache import made_by_one
 from gsx.engine.compile_cache import (
     FOLDER,
-    KeptFunction,
+    CachedFunction,
     flat,
-    lacking,
     make_ahead,
     recorded,
     sources_of,
     training_clock,
+    uncached,
 )
 from gsx.engine.compiling import available, compile_rows, with_last
 
@@ -64,21 +64,21 @@ def imported(folder: Path, source: str, changed: float = 0.0) -> types.ModuleTyp
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Returns where code is kept, empty at first; torch's own folder stays."""
-    monkeypatch.setattr("gsx.engine.compile_cache.place", lambda: tmp_path / FOLDER)
+    monkeypatch.setattr("gsx.engine.compile_cache.functions_folder", lambda: tmp_path / FOLDER)
     return tmp_path / FOLDER
 
 
 @contextmanager
 def made(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """Lists the functions that are compiled meanwhile, not loaded."""
-    names, make = list[str](), KeptFunction.make
+    names, make = list[str](), CachedFunction.make
 
-    def noted(self: KeptFunction, *arguments: Any) -> Any:
+    def noted(self: CachedFunction, *arguments: Any) -> Any:
         names.append(self.function.__name__)
         return make(self, *arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(KeptFunction, "make", noted)
+        patch.setattr(CachedFunction, "make", noted)
         yield names
 
 
@@ -145,7 +145,7 @@ def test_where_no_gradient_is_followed_it_is_one_code(folder: Path, monkeypatch:
 
 def test_code_of_other_source_options_or_machine_lies_elsewhere(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def file(function: Callable[..., Any] = weighted, power: int = 2, **options: Any) -> Path | None:
-        return KeptFunction(with_last(function, power), all_rows, options, set()).file(rows(6))
+        return CachedFunction(with_last(function, power), all_rows, options, set()).file(rows(6))
 
     monkeypatch.setattr("gsx.engine.compile_cache.sources_of", lambda module: module)
     files = [file(), file(power=3), file(option=1), file(imported(folder.parent, SOURCE).weighted)]
@@ -177,7 +177,7 @@ def test_code_whose_source_may_be_other_than_its_file_is_not_kept(folder: Path) 
     assert sources_of(edited.__name__) is None
     assert sources_of("of_no_file") is None
     offset = 2.0
-    closing = KeptFunction(lambda x, y: x + offset * y, all_rows, {}, set())
+    closing = CachedFunction(lambda x, y: x + offset * y, all_rows, {}, set())
     assert closing.code_for(rows(6)) is None
     compile_rows(edited.weighted, 2)(*rows(6))
     assert not folder.exists()
@@ -248,10 +248,10 @@ def test_damaged_code_is_made_again(
 
 
 def test_what_cannot_be_kept_is_left_to_torch(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(self: KeptFunction, arguments: object) -> None:
+    def broken(self: CachedFunction, arguments: object) -> None:
         raise RuntimeError("another torch")
 
-    monkeypatch.setattr(KeptFunction, "compile", broken)
+    monkeypatch.setattr(CachedFunction, "compile", broken)
     function = compile_rows(weighted, 2)
     assert all(agrees(function, *rows(count)) for count in (6, 11))
     assert not list(folder.glob("*.bin"))
@@ -261,7 +261,7 @@ def test_where_nothing_can_be_written_code_lasts_as_long_as_the_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").touch()
-    monkeypatch.setattr("gsx.engine.compile_cache.place", lambda: tmp_path / "file" / FOLDER)
+    monkeypatch.setattr("gsx.engine.compile_cache.functions_folder", lambda: tmp_path / "file" / FOLDER)
     function = compile_rows(weighted, 2)
     with made(monkeypatch) as names:
         assert all(agrees(function, *rows(count)) for count in (6, 7))
@@ -278,9 +278,9 @@ def test_calls_are_known_before_they_are_compiled(folder: Path, monkeypatch: pyt
     with made_by_one(file):  # another process compiles it
         make_ahead(calls)
     make_ahead(calls, stopping=lambda: True)
-    assert lacking(calls) == calls
+    assert uncached(calls) == calls
     make_ahead(calls)
-    assert not lacking(calls)
+    assert not uncached(calls)
     with made(monkeypatch) as compiled:
         function(x, y).sum().backward()
     assert compiled == []
@@ -296,7 +296,7 @@ def test_a_compiler_is_not_asked_for_where_calls_are_only_to_be_known(monkeypatc
 def test_nobody_asks_where_views_begin_whose_symbols_are_not_checked(folder: Path) -> None:
     views = [tuple(tensor[1:] for tensor in rows(count)) for count in (7, 9)]
     for unchecked, asked in ((set(), True), ({"SHAPE_ENV"}, False)):
-        kept = KeptFunction(with_last(weighted, 2), all_rows, {}, unchecked)
+        kept = CachedFunction(with_last(weighted, 2), all_rows, {}, unchecked)
         code = kept.make(folder / f"{asked}.bin", views[0])
         assert ("call_storage_offset" in code.run.__code__.co_names) == asked
         for x, y in views:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -28,9 +29,8 @@ from gsx.engine.backend import COMPILED
 from gsx.engine.compile_cache import TRACING, file_of, recorded
 from gsx.engine.compiled import Chunks, Rows, Stage, available, room_for_gradients
 from gsx.engine.compiling import IN_VECTORS, OWN_INDICES, WHOLE_LOOPS
-from gsx.engine.kernels import EXP_TOP, Kernels, Rules, exp_polynomial, kernels, thresholds
+from gsx.engine.kernels import EXP_TOP, Rules, blend, compile_loop, compiled_loop, exp_polynomial, thresholds
 from gsx.engine.lanes import Lanes
-from gsx.engine.segment_kernels import segment_kernels
 from gsx.engine.segments import parts
 
 pytestmark = pytest.mark.skipif(not available(), reason="no working compiler on this machine")
@@ -59,11 +59,11 @@ def test_picture_and_gradient_are_those_of_the_truth(schedule: str, scene: str) 
 def test_small_batches_draw_the_truth(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     groups = list[int]()  # of each call; two at once would leave the last of three alone, and torch specialises on that
 
-    def watched(rules: Rules) -> Kernels:
-        own = kernels(rules)
-        return replace(own, blend=lambda rows, *others: groups.append(len(rows)) or own.blend(rows, *others))
+    def watched(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
+        own = compiled_loop(loop, rules)
+        return (lambda rows, *others: groups.append(len(rows)) or own(rows, *others)) if loop is blend else own
 
-    monkeypatch.setattr("gsx.engine.compiled.kernels", watched)
+    monkeypatch.setattr("gsx.engine.compiled.compiled_loop", watched)
     rules, splats, camera = replace(QUICK, compiled_values=1), opaque(150, 5), front_camera(*size)
     errors = errors_of(splats, camera, rules, truth_of(splats, camera, rules))
     assert errors.largest <= 1e-5
@@ -229,8 +229,7 @@ def test_nothing_compiles_anew_in_steady_state() -> None:
         for splats in (random_splats(count, seed=seed), opaque(count, seed)):
             render_with_gradients(splats, front_camera(), replace(QUICK, schedule=schedule))
 
-    kernels.cache_clear()
-    segment_kernels.cache_clear()
+    compile_loop.cache_clear()
     with new_code() as first:
         for schedule in ("chunks", "segments"):
             draw(400, 5, schedule)

@@ -83,7 +83,7 @@ def test_picture_and_gradients_are_the_eager_ones(size: tuple[int, int]) -> None
 
 @pytest.mark.usefixtures("stand_in")
 def test_it_is_refused_with_a_remedy() -> None:
-    with pytest.raises(ConfigError, match="draws on a CUDA device, not on cpu: give device=cuda"):
+    with pytest.raises(ConfigError, match="draws on a CUDA device, not on cpu: set device=cuda"):
         GsplatCompositor().refuse(RasterSettings(**RULES), CPU)
     with pytest.raises(ConfigError, match=r"alpha_max is 0\.99, but gsplat has 0\.999"):
         GsplatCompositor(devices=("cpu",)).refuse(RasterSettings(), CPU)

@@ -485,7 +485,7 @@ def test_a_cache_that_cannot_be_written_only_costs_time(tmp_path, monkeypatch, c
     monkeypatch.setenv("GSX_CACHE", str(tmp_path / "file"))
     view = load(options(points=8)).train[0]
     assert view.image().shape == (3, 48, 64)
-    assert "made again next time" in caplog.text
+    assert "computed again next time" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -1,1 +1,1 @@
-"""How pixels are blended fast, and how compiled code is kept."""
+"""Compositors and their compiled code, the cache between runs, threads and processes."""

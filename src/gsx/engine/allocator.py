@@ -1,4 +1,4 @@
-"""Memory that a step frees is kept for the next step, instead of being asked for again page by page."""
+"""glibc's allocator: memory that a step frees is kept for the next step, instead of being returned page by page."""
 
 import ctypes
 import os
@@ -8,7 +8,7 @@ from contextlib import suppress
 TRIM_THRESHOLD, MMAP_MAX = -1, -4
 """glibc's options (malloc.h)."""
 MOST_KEPT = 1 << 30
-"""Bytes of free memory at the end of the heap, beyond which they are given back."""
+"""Bytes of free memory at the end of the heap above which they are returned to the system."""
 CHOSEN = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_MAX_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
 """Variables by which users choose for themselves."""
 
@@ -16,8 +16,8 @@ CHOSEN = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_MAX_", "MALLOC_MMAP_THRESHOLD_"
 def keep_freed_memory() -> None:
     """Lets glibc take large tensors from its heap, and keep up to MOST_KEPT bytes of what is freed at its end.
 
-    A step frees and asks again for hundreds of MB; by default each page of a large block costs a fault. Other C
-    libraries are left alone.
+    A step frees and allocates hundreds of MB; by default each page of a large block costs a fault. Other C libraries
+    are left alone.
     """
     if not sys.platform.startswith("linux") or any(name in os.environ for name in CHOSEN):
         return

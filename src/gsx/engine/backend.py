@@ -58,7 +58,7 @@ HOW: dict[Kernel, Callable[..., Kernel]] = {
     loss_slopes: compile_rows,
     photometric_and_gradient: partial(compile_sides, (1, 2)),
 }
-"""How each kernel is compiled; others run as they stand."""
+"""Compilation of each kernel; all others run uncompiled."""
 
 
 @cache
@@ -70,7 +70,7 @@ def compiled_kernel(
 
 
 class CompiledBackend(Backend):
-    """Runs kernels through torch.compile where a compiler works, else as they stand."""
+    """The backend that runs kernels through torch.compile; without a working compiler they run uncompiled."""
 
     compiled = True
 

@@ -1,6 +1,6 @@
-"""The cache: results that are expensive to compute, kept between runs: photos, reconstructions, networks, states.
+"""The cache of results that are expensive to compute, between runs: photos, reconstructions, networks, states.
 
-An entry is a folder <kind>/<key> with a manifest of its files. Whatever differs from the manifest is made again.
+An entry is a folder <kind>/<key> with a manifest of its files. Files that differ from it are computed again.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ from gsx.core.files import expand_home, process_tag
 logger = logging.getLogger(__name__)
 
 MANIFEST = ".gsx_manifest.jsonl"
-"""File of an entry with a line for each of its files; of several for one file the last counts."""
+"""File of an entry with a line for each of its files; the last line of a file counts."""
 IN_USE = "in_use"
 """Folder of the cache with a locked file of each process that uses it."""
 
@@ -41,8 +41,7 @@ def cache_root() -> Path:
     root = expand_home(name)
     if str(root).startswith("~"):
         raise InputError(
-            f"the cache would be {name}, and there is no such home folder: let GSX_CACHE name a folder that can be "
-            "written"
+            f"the cache folder {name} has no home folder: set GSX_CACHE to a writable folder"
         )
     return root
 
@@ -53,7 +52,7 @@ def cache_folder(kind: str, key: str) -> Path:
 
 
 def content_key(*parts: object) -> str:
-    """Digests `parts` into a short hexadecimal key; parts whose `repr` differs, or is split otherwise, differ."""
+    """Digests the `repr` of `parts` into a short hexadecimal key."""
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:KEY_LETTERS]
 
 
@@ -95,8 +94,7 @@ def make_folder(folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            f"Cannot create the cache folder {folder} ({error.strerror}): let GSX_CACHE name a folder that can be "
-            "written to."
+            f"Cannot create the cache folder {folder} ({error.strerror}): set GSX_CACHE to a writable folder."
         ) from None
     return folder
 
@@ -105,7 +103,7 @@ def make_folder(folder: Path) -> Path:
 
 
 def enlist(*files: Path) -> None:
-    """Notes size and digest of files in the manifest of their entry, the folder in which they lie.
+    """Adds size and digest of files to the manifest of their entry, the folder that holds them.
 
     Raises:
         OSError: the manifest cannot be written.
@@ -133,16 +131,16 @@ def listed(entry: Path, name: str = "") -> dict[str, dict[str, Any]]:
 
 
 def whole(file: Path) -> bool:
-    """Checks that a file of an entry is as it was written, and marks the entry as used now; warns of a damaged file."""
+    """Checks that a file of an entry is as written, and marks the entry as used now; warns of a damaged file."""
     try:
         content = file.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
         return False
     except OSError as error:
-        logger.warning("%s cannot be read (%s): it is made again", file, error.strerror)
+        logger.warning("%s cannot be read (%s), computing it again", file, error.strerror)
         return False
     if listed(file.parent, file.name).get(file.name) != fingerprint(content):
-        logger.warning("%s is not as it was written: it is made again", file)
+        logger.warning("%s is damaged, computing it again", file)
         return False
     with suppress(OSError):
         os.utime(file.parent / MANIFEST)
@@ -154,7 +152,7 @@ def whole(file: Path) -> bool:
 
 @contextmanager
 def made_by_one(file: Path, wait: bool = False) -> Iterator[bool]:
-    """Locks the making of a file; yields whether this process has the lock. Where nothing can be locked, all have it.
+    """Locks the making of a file; yields True in the process that has the lock, and in all where locking fails.
 
     `wait`: until the other process has finished. The lock of a killed process is free.
     """
@@ -168,7 +166,7 @@ def made_by_one(file: Path, wait: bool = False) -> Iterator[bool]:
         try:
             alone = lock_descriptor(stream.fileno(), blocking=False)
             if wait and not alone:
-                logger.info("waiting for another process, which is making %s ...", file.name.partition("-")[0])
+                logger.info("waiting for another process that makes %s ...", file.name.partition("-")[0])
                 alone = lock_descriptor(stream.fileno())
         except OSError:
             alone = True
@@ -177,9 +175,9 @@ def made_by_one(file: Path, wait: bool = False) -> Iterator[bool]:
 
 @contextmanager
 def in_use() -> Iterator[None]:
-    """Keeps `trim` of other processes from removing what this process uses of the cache from now on.
+    """Protects cache entries that this process uses from now on against `trim` of other processes.
 
-    A killed process keeps nothing. Where nothing can be written or locked, nothing is kept.
+    The protection ends with the process. There is none where nothing can be written or locked.
     """
     with ExitStack() as stack:
         try:
@@ -190,19 +188,19 @@ def in_use() -> Iterator[None]:
             lock_descriptor(stack.enter_context(partial.open("w")).fileno(), blocking=False)
             partial.replace(locked)
         except (OSError, InputError) as error:
-            logger.info("other processes cannot know that this one uses the cache: %s", error)
+            logger.info("cache entries in use are not protected from other processes: %s", error)
         yield
 
 
 def remove_files(*paths: Path) -> None:
-    """Removes files, as far as they are there and can be removed."""
+    """Removes files; ignores errors."""
     for path in paths:
         with suppress(OSError):
             path.unlink()
 
 
 def used_since() -> float:
-    """Returns when the oldest process that uses the cache began, seconds since 1970; infinite if there is none."""
+    """Returns the start of the oldest process that uses the cache, seconds since 1970; infinite if there is none."""
     starts = []
     for path in (cache_root() / IN_USE).glob(".use.*.lock"):
         with suppress(OSError):
@@ -214,7 +212,7 @@ def used_since() -> float:
 
 
 def released(path: Path) -> bool:
-    """Checks whether the process that locked a file has ended; assumes that it runs where nobody can know."""
+    """Checks that the process that locked a file has ended; False where that is unknown."""
     try:
         with path.open("r+") as stream:  # some network file systems lock nothing that is open for reading alone
             return lock_descriptor(stream.fileno(), blocking=False)
@@ -226,9 +224,9 @@ def released(path: Path) -> bool:
 
 
 def trim(gigabytes: float) -> list[Path]:
-    """Removes the entries used longest ago until the rest fit into so many 10^9 bytes; returns what it removed.
+    """Removes the entries used longest ago until the rest fit into `gigabytes` (10^9 bytes); returns them.
 
-    Entries that a running process uses stay, and so does what has no manifest, since it is not gsx's.
+    Entries that a running process uses stay, and so do folders without a manifest, which are not gsx's.
     """
     since, removed = used_since(), []
     used, sizes = entries()
@@ -239,12 +237,12 @@ def trim(gigabytes: float) -> list[Path]:
             removed.append(entry)
     if removed:
         freed = sum(sizes[entry] for entry in removed) / 1e9
-        logger.info("%d entries made room in the cache (%.1f GB)", len(removed), freed)
+        logger.info("cache: removed %d entries (%.1f GB)", len(removed), freed)
     return removed
 
 
 def entries() -> tuple[dict[Path, float], dict[Path, int]]:
-    """Returns when each entry of the cache was last used, seconds since 1970, and its bytes."""
+    """Returns (last use of each entry, seconds since 1970; its bytes)."""
     used, sizes, manifests = {}, {}, list[Path]()
     with suppress(OSError):  # another process may remove the cache meanwhile
         manifests += cache_root().glob(f"*/*/{MANIFEST}")
@@ -256,7 +254,7 @@ def entries() -> tuple[dict[Path, float], dict[Path, int]]:
 
 
 def remove_entry(entry: Path, used: float) -> bool:
-    """Removes an entry that was not used since; its manifest last, so that what is left of it is still an entry."""
+    """Removes an entry not used since `used`; its manifest last, so that a partly removed entry is still an entry."""
     try:
         if (entry / MANIFEST).stat().st_mtime != used:
             return False

@@ -1,4 +1,4 @@
-"""Python's collector of reference cycles, paused where it costs time and finds next to nothing."""
+"""Python's collector of reference cycles, paused where it costs time and frees next to nothing."""
 
 import gc
 import sys
@@ -20,10 +20,10 @@ def gc_paused() -> Iterator[None]:
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """Pauses the collector while a program imports torch, and keeps it from walking through these objects ever again.
+    """Pauses the collector while a program imports torch, and freezes the imported objects.
 
-    Half of such walks come where Python ends. Where torch is there already, other objects are to be collected: then
-    they are only paused. OpenImageIO must be imported later: its binding complains of objects left in the end.
+    Half of the walks through them come at exit. If torch is imported already, nothing is frozen. OpenImageIO must be
+    imported later: its binding complains about objects left at exit.
     """
     first = "torch" not in sys.modules
     with gc_paused():

@@ -1,4 +1,4 @@
-"""What a training step needs is compiled before the first step; a second process compiles half of it."""
+"""Compilation of all that a training step needs, before the first step; a second process compiles half of it."""
 
 import json
 import os
@@ -20,38 +20,38 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.engine.backend import COMPILED
-from gsx.engine.compile_cache import Call, lacking, make_ahead, place, recorded
+from gsx.engine.compile_cache import Call, functions_folder, make_ahead, recorded, uncached
 from gsx.engine.compositors import COMPOSITORS
 
 WARM_SPLATS, WARM_SIZE = 2000, (128, 96)
-"""Of the picture whose drawing compiles everything: lists of several chunks in several groups."""
+"""Splats and size of the picture whose drawing compiles everything: lists of several chunks in several groups."""
 HELPER = "import sys; from gsx.engine.compile_ahead import help_compiling; help_compiling(sys.argv[1])"
-"""The second process."""
+"""Program of the second process."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """What the code of a step depends on: the rules of the rasterizer and the backbone."""
+    """Rules of the rasterizer and the backbone that the code of a step depends on."""
 
     settings: RasterSettings
     sh_degree: int = 0
-    """Degree of the harmonics by which colours change with direction."""
+    """Degree of the spherical harmonics."""
     absolute_gradient: bool = False
-    """Whether the backbone wants absolute gradients of screen means."""
+    """True if the backbone needs absolute gradients of screen means."""
 
 
 def compile_ahead(
     step: Step, device: torch.device, helped: bool = True, stopping: Callable[[], bool] = lambda: False
 ) -> float:
-    """Compiles all that a step needs and that is not kept, until `stopping`; returns the seconds that it took.
+    """Compiles all that a step needs and that is not cached, until `stopping`; returns the seconds that it took.
 
     `helped`: by a second process on a CPU.
     """
     start = time.perf_counter()
     calls = needed(step, device)
-    missing = lacking(calls)
+    missing = uncached(calls)
     if missing:
-        with helper(step, helped and len(missing) > 1 and place() is not None):
+        with helper(step, helped and len(missing) > 1 and functions_folder() is not None):
             make_ahead(calls, stopping)
             if not stopping():
                 draw_one(step, device)
@@ -59,14 +59,14 @@ def compile_ahead(
 
 
 def needed(step: Step, device: torch.device) -> list[Call]:
-    """Lists the compiled calls of a step; on a GPU they are compiled by now, and there are none."""
+    """Lists the compiled calls of a step; on a GPU it compiles them at once and lists none."""
     with recorded() as calls:
         draw_one(step, device)
     return calls
 
 
 def draw_one(step: Step, device: torch.device) -> None:
-    """Takes a small picture through all that a step compiles."""
+    """Runs a small picture through all that a step compiles."""
     splats, degree = warm_splats(device), step.sh_degree
     rest = Parameter(torch.zeros(len(splats), (degree + 1) ** 2 - 1, 3, device=device))
     colours = colours_of(splats.colours[:, None], rest, splats.means, degree, COMPILED)
@@ -82,7 +82,7 @@ def warm_camera() -> Camera:
 
 
 def warm_splats(device: torch.device) -> Splats:
-    """Draws faint splats before the camera from a generator of their own: a run's randomness stays untouched."""
+    """Draws faint splats before the camera from their own generator, which leaves a run's randomness unchanged."""
     generator = torch.Generator().manual_seed(0)
     means = torch.rand(WARM_SPLATS, 3, generator=generator) * 2 - 1
     fields = {
@@ -99,18 +99,18 @@ def warm_splats(device: torch.device) -> Splats:
 
 
 @contextmanager
-def helper(step: Step, wanted: bool = True) -> Iterator[None]:
+def helper(step: Step, enabled: bool = True) -> Iterator[None]:
     """Runs a process that compiles the calls of a step from the last to the first, as long as the context lasts.
 
-    There is none if this process has a single thread, or where the system starts no other.
+    Starts none if this process has a single thread, or if the system refuses.
     """
     process = None
-    if wanted and torch.get_num_threads() > 1:
+    if enabled and torch.get_num_threads() > 1:
         fields = vars(step) | {"settings": step.settings.options, "threads": torch.get_num_threads()}
         with suppress(OSError):
             process = subprocess.Popen(
                 [sys.executable, "-P", "-c", HELPER, json.dumps(fields)],
-                stdin=subprocess.PIPE,  # its end tells the process to stop, also if this one is killed
+                stdin=subprocess.PIPE,  # its end stops the process, also if this one is killed
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl-C is for this process alone
@@ -141,7 +141,7 @@ def help_compiling(words: str) -> None:
 
 
 def end_with_input() -> None:
-    """Ends this process and its compilers when standard input ends, since the process that began it is gone."""
+    """Ends this process and its compilers when standard input ends, since the process that started it is gone."""
     sys.stdin.buffer.read()
     if os.name == "posix" and os.getpgrp() == os.getpid():
         os.killpg(os.getpid(), signal.SIGTERM)

@@ -1,8 +1,8 @@
-"""Compiled functions that are kept on disk between processes, on a CPU.
+"""Compiled functions, cached on disk between processes, on a CPU.
 
-torch keeps the code that it generates, but traces each function anew in every process: seconds for each unrolled loop.
-Here `aot_compile` (experimental) keeps the whole function with its conditions; loading it takes milliseconds.
-Whatever fails is left to torch.compile.
+torch caches the code that it generates, but traces each function anew in every process: seconds for each unrolled loop.
+Here `aot_compile` (experimental) saves the whole function with its conditions; loading it takes milliseconds. Any
+failure falls back to torch.compile.
 """
 
 import functools
@@ -35,34 +35,34 @@ from gsx.engine.machine import processor_kind
 logger = logging.getLogger(__name__)
 
 FOLDER = "functions"
-"""Below the folder in which torch keeps its code."""
+"""Folder below that of torch's code."""
 VARIANTS = 8
-"""Variants of one function for one kind of arguments: as many as torch makes before it gives up."""
+"""Most variants of one function for one kind of arguments: torch's limit."""
 CHECKED = ("TENSOR_MATCH", "DUPLICATE_INPUT", "SHAPE_ENV")
-"""torch's conditions that are checked at a call: dtypes, strides, constant sizes, equal arguments, relations of sizes
-that vary. Other values are part of the lookup, and the code that the function calls is part of the file's name."""
+"""torch's conditions that a call checks: dtypes, strides, constant sizes, equal arguments, relations of varying sizes.
+Other values are part of the lookup, and the code that the function calls is part of the file's name."""
 TRACING: dict[str, Any] = {"automatic_dynamic_shapes": False, "record_runtime_overhead": False}
-"""How torch traces: without guesses from earlier compilations, and without marks for its profiler around each call."""
+"""Options of tracing: no guesses from earlier compilations, and no profiler marks around each call."""
 ROOMS = ("core/data", "core/gaussians", "core/quality", "core/rasterizer", "engine")
-"""Packages of gsx that hold what its compiled functions call; import contracts keep them from the others."""
+"""Packages of gsx whose code its compiled functions call; import contracts keep them from the others."""
 IMPORTED = time.time()
-"""Files that are newer may differ from the code that this process runs."""
+"""Newer files may differ from the code that this process runs."""
 LIBRARY = re.compile(r"(/\S+\.so): ")
-"""A library that cannot be loaded, in the system's message."""
+"""Path of a library that cannot be loaded, in the system's message."""
 
 Arguments: TypeAlias = tuple[Any, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Code:
-    """Compiled code, and the check whether it holds for arguments by name."""
+    """Compiled code, and a check that it holds for arguments by name."""
 
     holds: Callable[[dict[str, Any]], bool]
     run: Callable[..., Any]
 
 
-def place() -> Path | None:
-    """Returns where compiled functions are kept, beside torch's own code; None where no such folder is set."""
+def functions_folder() -> Path | None:
+    """Returns the folder of compiled functions, next to torch's own code; None where no such folder is set."""
     folder = os.environ.get("TORCHINDUCTOR_CACHE_DIR")
     return Path(folder) / FOLDER if folder else None
 
@@ -83,13 +83,13 @@ def sources_of(module: str) -> str | None:
     places = rooms if any(Path(file).is_relative_to(room) for room in rooms) else [*rooms, package_of(Path(file))]
     edited = [path for path in source_files(*places) if path.stat().st_mtime > IMPORTED]
     if edited:
-        logger.info("compiled code is not kept: %s was edited after this process began", edited[0])
+        logger.info("compiled code is not cached: %s was edited after this process started", edited[0])
         return None
     return source_digest(*places)
 
 
 def package_of(file: Path) -> Path:
-    """Returns the folder of the outermost package that holds a module; the file itself where there is none."""
+    """Returns the folder of the outermost package of a module, or the file itself."""
     while (file.parent / "__init__.py").exists():
         file = file.parent
     return file
@@ -97,7 +97,7 @@ def package_of(file: Path) -> Path:
 
 @functools.cache
 def machine() -> tuple[object, ...]:
-    """Lists what compiled code depends on beside its source; read once, since torch changes the environment."""
+    """Lists versions, processor and settings that compiled code depends on; once: torch edits the environment."""
     settings = sorted(
         (name, value)
         for name, value in os.environ.items()
@@ -113,7 +113,7 @@ def machine() -> tuple[object, ...]:
 
 
 def form_of(value: Any, varying: set[tuple[int, int]]) -> object:
-    """Describes an argument as far as compiled code depends on it; leaves out sizes that vary, (tensor, axis)."""
+    """Describes an argument as far as compiled code depends on it, without `varying` sizes, (tensor, axis)."""
     if isinstance(value, list | tuple):
         return [form_of(one, varying) for one in value]
     if not isinstance(value, Tensor):
@@ -123,7 +123,7 @@ def form_of(value: Any, varying: set[tuple[int, int]]) -> object:
 
 
 def modes(arguments: Arguments) -> tuple[object, ...]:
-    """Lists what code depends on beside its arguments: gradients, threads, determinism, default dtype."""
+    """Lists the modes that code depends on: gradients, threads, determinism, default dtype."""
     followed = torch.is_grad_enabled() and requires_gradient(arguments)
     deterministic = torch.are_deterministic_algorithms_enabled()
     return followed, torch.get_num_threads(), deterministic, torch.get_default_dtype()
@@ -144,7 +144,7 @@ def kind_of(value: Any) -> object:
 
 
 def flat(arguments: Iterable[Any]) -> list[Tensor]:
-    """Lists arguments, and in place of lists their members."""
+    """Lists arguments; members in place of lists."""
     tensors = list[Tensor]()
     for value in arguments:
         tensors += value if isinstance(value, list) else [value]
@@ -155,7 +155,7 @@ def flat(arguments: Iterable[Any]) -> list[Tensor]:
 
 
 def load(file: Path, options: dict[str, Any]) -> Code | None:
-    """Loads what `save` wrote; None where this torch can load nothing. Other `options` would compile its C++ anew."""
+    """Loads a file of `save`; None if this torch cannot. Other `options` would compile its C++ anew."""
     from torch._inductor import config  # takes seconds to import
 
     try:
@@ -165,27 +165,27 @@ def load(file: Path, options: dict[str, Any]) -> Code | None:
     except FileNotFoundError:
         return None
     except Exception as error:  # unpickling a damaged file can raise anything
-        logger.info("compiled code in %s cannot be loaded (%s): it is made again", file, first_line(error))
+        logger.info("compiled code in %s cannot be loaded (%s), compiling again", file, first_line(error))
         return None
 
 
 def save(compiled: Any, file: Path) -> None:
-    """Keeps what torch compiled; where that fails, the next process compiles again."""
+    """Saves compiled code; if that fails, the next process compiles again."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as temporary:
             compiled.save_compiled_function(str(temporary))
     except Exception as error:  # a full disk, or something of this function that cannot be written
-        logger.info("compiled code is not kept in %s: %s", file, first_line(error))
+        logger.info("compiled code is not cached in %s: %s", file, first_line(error))
 
 
 def code_of(compiled: Any) -> Code:
-    """Takes code and conditions from what torch compiled or loaded."""
+    """Extracts code and conditions from a function that torch compiled or loaded."""
     return Code(compiled._artifacts.guard_manager.check, compiled.fn)
 
 
 def forget_failure(error: Exception) -> None:
-    """Lets torch compile again after a compiler was killed, now (Ctrl-C) or earlier, leaving part of a library."""
+    """Lets torch compile again after a killed compiler has left part of a library."""
     from torch._inductor import codecache
 
     for name in ("CppCodeCache", "CppPythonBindingsCodeCache"):
@@ -198,11 +198,11 @@ def forget_failure(error: Exception) -> None:
 # -- functions ---------------------------------------------------------------------------------------------------------
 
 
-class KeptFunction:
-    """A function of tensors through torch.compile, whose code is kept in the folder `place()` between processes.
+class CachedFunction:
+    """A function of tensors through torch.compile, whose code is cached in `functions_folder()` between processes.
 
-    `varying`: sizes (tensor, axis) of arguments that may differ at the next call; `unchecked`: those of CHECKED that
-    need no check.
+    `varying`: sizes (tensor, axis) of arguments that may differ at the next call; `unchecked`: conditions of CHECKED to
+    skip.
     """
 
     def __init__(
@@ -219,7 +219,7 @@ class KeptFunction:
         self.codes: dict[tuple[object, ...], list[Code]] = {}
 
     def code_for(self, arguments: Arguments) -> Code | None:
-        """Returns code that holds for arguments; None where that is left to torch.compile."""
+        """Returns code that holds for arguments; None: left to torch.compile."""
         kind = (*modes(arguments), *map(kind_of, arguments))
         codes, named = self.codes.setdefault(kind, []), self.named(arguments)
         for code in codes:
@@ -232,18 +232,18 @@ class KeptFunction:
             with waiting(), made_by_one(file, wait=True):
                 known, slot = self.find(file, arguments)
                 if known is None:
-                    logger.info("compiling %s once; later runs find it on disk ...", self.function.__name__)
+                    logger.info("compiling %s, once for all later runs ...", self.function.__name__)
                 code = known or self.make(slot, arguments)
-        except Exception as error:  # of an experimental interface; torch.compile reports what is really wrong
-            logger.info("%s is compiled without being kept (%s)", self.function.__name__, first_line(error))
+        except Exception as error:  # of an experimental interface; torch.compile reports the true cause
+            logger.info("%s is compiled, not cached (%s)", self.function.__name__, first_line(error))
             self.works = False
             return None
         codes.append(code)
         return code
 
     def file(self, arguments: Arguments) -> Path | None:
-        """Returns where code for such arguments is kept; None where none is."""
-        folder, sources = place(), sources_of(self.function.__module__)
+        """Returns the file of code for such arguments; None: not cached."""
+        folder, sources = functions_folder(), sources_of(self.function.__module__)
         if not (folder and sources and self.works) or self.function.__closure__:
             return None
         varying = {(id(tensor), axis) for tensor, axis in self.varying(arguments)}
@@ -254,9 +254,9 @@ class KeptFunction:
         return folder / f"{self.function.__name__}-{key}.bin"
 
     def find(self, file: Path, arguments: Arguments) -> tuple[Code | None, Path]:
-        """Returns (code from the disk, if one holds; where to keep new code).
+        """Returns (code from the disk that holds, or None; file for new code).
 
-        torch makes code of its own for a few sizes, above all one row: it lies beside the first, by number.
+        torch specialises code for a few sizes, above all one row: such code is numbered from 1.
         """
         for slot in (file, *(file.with_name(f"{file.stem}-{number}.bin") for number in range(1, VARIANTS))):
             code = load(slot, self.options)
@@ -265,7 +265,7 @@ class KeptFunction:
         return None, file
 
     def make(self, file: Path, arguments: Arguments) -> Code:
-        """Compiles code and keeps it.
+        """Compiles code and saves it.
 
         Raises:
             ValueError: it does not hold for these arguments.
@@ -277,16 +277,16 @@ class KeptFunction:
             compiled = self.compile(arguments)
         code = code_of(compiled)
         if not code.holds(self.named(arguments)):
-            raise ValueError("its code does not hold for what it was made for")
+            raise ValueError("the compiled code does not hold for its own arguments")
         save(compiled, file)
         return code
 
     def named(self, arguments: Arguments) -> dict[str, Any]:
-        """Returns arguments by name, without the last ones, which have default values."""
+        """Returns arguments by name, without the last ones, which have defaults."""
         return dict(zip(self.names, arguments, strict=False))
 
     def compile(self, arguments: Arguments) -> Any:
-        """Has torch compile the function for such arguments."""
+        """Compiles the function for such arguments."""
         options = self.options | {"guard_filter_fn": lambda guards: [g.guard_type in self.checked for g in guards]}
         arguments = tuple(map(without_gradient, arguments))
         if "SHAPE_ENV" not in self.checked:
@@ -300,7 +300,7 @@ class KeptFunction:
 
 
 def without_gradient(value: Any) -> Any:
-    """Returns a parameter without its gathered gradient, which code would depend on."""
+    """Returns a parameter without its accumulated gradient, on which code would depend."""
     if not isinstance(value, Tensor) or not value.requires_grad:
         return value
     alone = value.detach().clone(memory_format=torch.preserve_format).requires_grad_()
@@ -319,7 +319,7 @@ def without_offset(value: Any) -> Any:
 
 
 class Waited(threading.local):
-    """Seconds for which a thread has waited for compiled code."""
+    """Time that a thread has waited for compiled code, seconds."""
 
     seconds = 0.0
 
@@ -338,16 +338,16 @@ def waiting() -> Iterator[None]:
 
 
 def training_clock() -> float:
-    """Returns seconds of a clock that stands still while its thread waits for code to be compiled or read."""
+    """Returns the seconds of a clock that stops while its thread waits for code to be compiled or read."""
     return time.perf_counter() - WAITED.seconds
 
 
 # -- ahead -------------------------------------------------------------------------------------------------------------
 
-Call: TypeAlias = tuple[KeptFunction, Arguments, bool]
-"""A function, its arguments, and whether gradients were enabled."""
+Call: TypeAlias = tuple[CachedFunction, Arguments, bool]
+"""A function, its arguments, and if gradients were enabled."""
 RECORDED: ContextVar[list[Call] | None] = ContextVar("RECORDED", default=None)
-"""Calls so far; functions run uncompiled meanwhile. None: nothing is recorded."""
+"""Calls so far; None: not recording."""
 
 
 @contextmanager
@@ -366,27 +366,27 @@ def recording() -> bool:
     return RECORDED.get() is not None
 
 
-def record(function: KeptFunction, arguments: Arguments) -> bool:
-    """Records a call, if calls are recorded; returns whether they are."""
+def record(function: CachedFunction, arguments: Arguments) -> bool:
+    """Records a call, if calls are recorded; returns True if they are."""
     calls = RECORDED.get()
     if calls is not None:
         calls.append((function, arguments, torch.is_grad_enabled()))
     return calls is not None
 
 
-def file_of(function: KeptFunction, arguments: Arguments, gradients: bool) -> Path | None:
-    """Returns where code for a call is kept; None where none is."""
+def file_of(function: CachedFunction, arguments: Arguments, gradients: bool) -> Path | None:
+    """Returns the file of code for a call; None: not cached."""
     with torch.set_grad_enabled(gradients):
         return function.file(arguments)
 
 
-def lacking(calls: Sequence[Call]) -> list[Call]:
-    """Returns the calls whose code is not kept yet."""
+def uncached(calls: Sequence[Call]) -> list[Call]:
+    """Returns the calls whose code is not cached yet."""
     return [call for call in calls if (file := file_of(*call)) is None or not file.exists()]
 
 
 def make_ahead(calls: Sequence[Call], stopping: Callable[[], bool] = lambda: False) -> None:
-    """Compiles and keeps code for calls that lack it, until `stopping`; skips what another process compiles."""
+    """Compiles and saves code for uncached calls, until `stopping`; skips those that another process compiles."""
     for function, arguments, gradients in calls:
         if stopping():
             return

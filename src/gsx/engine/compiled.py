@@ -1,7 +1,7 @@
 """The compiled path: the picture and gradient of composite.py through loops that are compiled once (kernels.py).
 
-Two schedules of the same mathematics. `chunks`: front to back, one chunk of all groups of lists at a time, and groups
-whose pixels have all ended leave; light is found first in lists that are cut into pieces (lanes.py). `segments`: all
+Two schedules of the same mathematics. `chunks`: front to back, one chunk of all groups of lists at a time; groups whose
+pixels have all ended leave. For lists that are cut into pieces (lanes.py) light is computed first. `segments`: all
 blocks of all tiles at once (segments.py).
 """
 
@@ -24,20 +24,30 @@ from gsx.core.shapes import Float, Int
 from gsx.engine.backend import COMPILED
 from gsx.engine.compile_cache import recording
 from gsx.engine.compiling import available, complaint
-from gsx.engine.kernels import TABLE, Kernels, Rules, exp_polynomial, kernels, seen_from_front
+from gsx.engine.kernels import (
+    TABLE,
+    Rules,
+    blend,
+    compiled_loop,
+    exp_polynomial,
+    gradients,
+    make_rows,
+    transmit,
+    weighted_picture,
+)
 from gsx.engine.lanes import LANES, Lanes, centres, from_lanes, lay_out, places_of, to_lanes
 from gsx.engine.segments import SegmentComposite, cut, parts, segment_job
 
 logger = logging.getLogger(__name__)
 
 MOST_CHANNELS = 8
-"""Channels are unrolled: beyond this number compilation takes longer than it saves."""
+"""Most channels to unroll: beyond it compilation takes longer than it saves."""
 CHECK_EVERY = 4
-"""Chunks between looks at which groups have ended."""
+"""Chunks between checks which groups have ended."""
 VALUES, VALUES_OF_A_GPU = 1 << 22, 1 << 26
-"""Alpha values at once where `compiled_values` leaves it to the device, a CPU or not."""
+"""Alpha values at once where `compiled_values` is 0: on a CPU, elsewhere."""
 WORTH_LEAVING = 0.75
-"""Groups are picked out when at most this share of them is still going: picking costs a copy."""
+"""Largest share of groups still going for which they are picked out: picking costs a copy."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,17 +58,16 @@ class Job:
     grid: TileGrid
     basis: Basis
     centre: Float[Tensor, "S 2 1 L"]
-    loops: Kernels
     rules: Rules
     precision: Precision
     batch: int
-    """Groups worked on at once."""
+    """Groups processed at once."""
     learning: bool
-    """Whether there will be a way back."""
+    """True if a backward pass follows."""
 
 
 def rules_of(settings: RasterSettings, channels: int, absolute: bool, evaluation: torch.dtype, device: str) -> Rules:
-    """What the compiled code depends on."""
+    """Returns the constants of the compiled code."""
     powers, squarings = exp_polynomial(math.log(settings.alpha_min))
     return Rules(
         tile_size=settings.tile_size,
@@ -78,7 +87,7 @@ def rules_of(settings: RasterSettings, channels: int, absolute: bool, evaluation
 def padded_table(
     means: Tensor, conic_factors: Tensor, log_opacities: Tensor, channels: Tensor
 ) -> Float[Tensor, "M_1 F"]:
-    """Everything blending needs of each splat in one row, and last a row that draws nothing."""
+    """Returns one row per splat with all that blending needs, and last a row that draws nothing."""
     table = torch.cat([means, conic_factors, log_opacities[:, None], channels], 1)
     nothing = table.new_zeros(1, table.shape[1])
     nothing[:, TABLE - 1].fill_(NOTHING)  # an assignment might copy the number from the host
@@ -89,7 +98,7 @@ def padded_table(
 
 
 Where: TypeAlias = range | Int[Tensor, "B"]
-"""Rows that follow each other, or indices once groups have left."""
+"""Consecutive rows, or indices once groups have left."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +112,13 @@ class Stage:
 
 
 class Rows:
-    """A tensor by its rows, of which the same are wanted again and again: a view takes as long as a small chunk."""
+    """A tensor whose slices of rows are cached: making a view takes as long as a small chunk."""
 
     def __init__(self, values: Float[Tensor, "N *rest"]) -> None:
         self.values, self.views = values, dict[range, Tensor]()
 
     def take(self, where: Where) -> Float[Tensor, "B *rest"]:
-        """Rows as a view of something: torch compiles anew for arguments that are no views."""
+        """Returns rows as a view: torch compiles anew for arguments that are no views."""
         if not isinstance(where, range):
             return self.values[where][:]
         view = self.views.get(where)
@@ -120,26 +129,26 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Chunks:
-    """What the chunk schedule keeps for its way back."""
+    """Values that the backward pass of the chunk schedule needs."""
 
     stages: list[Stage]
     rows: Rows
-    """What blending reads of every entry, [S K F L]."""
+    """Columns of every entry, [S K F L]."""
     front: Rows
     """Transmittance in front of every list, 0 at pixels of border tiles beyond the raster, [G P L]."""
     after: Rows
     """Transmittance behind every block, [S P L]."""
     pieces: tuple[Float[Tensor, "G P L"], list[Float[Tensor, "G P L"]]] | None
-    """(share of the light that passes each list which another piece follows, what every list adds to the channels and
-    the coverage); None where no list is cut."""
+    """(transmittance of each list that another piece follows, what every list adds to channels and coverage); None: no
+    list is cut."""
 
     def before(self, stage: Stage) -> Float[Tensor, "B P L"]:
-        """Transmittance in front of a stage's blocks."""
+        """Returns the transmittance in front of a stage's blocks."""
         return self.front.take(stage.groups) if stage.previous is None else self.after.take(stage.previous)
 
 
 def stage_of(job: Job, number: int, batch: slice, left: Int[Tensor, "B"] | None) -> Stage | None:
-    """Chunk `number` of a batch of groups, or of those of them that are `left`; None where no group has it."""
+    """Returns chunk `number` of a batch of groups, or of those of them that are `left`; None where no group has it."""
     lanes, begin = job.lanes, batch.start
     if number >= len(lanes.active) or lanes.active[number] <= begin:
         return None
@@ -153,7 +162,7 @@ def stage_of(job: Job, number: int, batch: slice, left: Int[Tensor, "B"] | None)
 
 
 def leave(job: Job, stage: Stage, kept: Chunks) -> Int[Tensor, "B"] | None:
-    """Groups that go on, where enough have ended for the others to be picked out; at least two, for the compiler."""
+    """Returns the groups that go on; None where too few have ended to pick them out. At least two, for the compiler."""
     going = kept.after.take(stage.blocks).amax((1, 2)) >= job.rules.stop  # a pixel of theirs has not ended
     total = int(going.sum())
     if total > WORTH_LEAVING * len(going):
@@ -165,10 +174,10 @@ def leave(job: Job, stage: Stage, kept: Chunks) -> Int[Tensor, "B"] | None:
     return groups[going]
 
 
-def blend_stage(job: Job, blend: Callable[..., None], stage: Stage, accumulated: list[Rows], kept: Chunks) -> None:
-    """Blend one stage by `blend` into `accumulated` and `kept.after`."""
+def blend_stage(job: Job, loop: Callable[..., None], stage: Stage, accumulated: list[Rows], kept: Chunks) -> None:
+    """Blends one stage by `loop` into `accumulated` and `kept.after`."""
     part, after = [channel.take(stage.groups) for channel in accumulated], kept.after.take(stage.blocks)
-    blend(kept.rows.take(stage.blocks), job.basis.x, job.basis.y, kept.before(stage), after, part)
+    loop(kept.rows.take(stage.blocks), job.basis.x, job.basis.y, kept.before(stage), after, part)
     if not isinstance(stage.groups, range):
         kept.after.values[stage.blocks] = after
         for channel, value in zip(accumulated, part, strict=True):
@@ -176,18 +185,18 @@ def blend_stage(job: Job, blend: Callable[..., None], stage: Stage, accumulated:
 
 
 def shares(job: Job, rows: Rows, like: Float[Tensor, "G P L"]) -> Float[Tensor, "G P L"]:
-    """Share of the light that passes each list which another piece follows, and some others; 1 elsewhere."""
-    transmit, passed = job.loops.transmit, Rows(torch.ones_like(like))
+    """Returns the transmittance of each list that another piece follows, and of some others; 1 elsewhere."""
+    loop, passed = compiled_loop(transmit, job.rules), Rows(torch.ones_like(like))
     followed = max(int(groups.max()) + 1 for _, (groups, _) in job.lanes.follows)  # the longest lists, hence first
     for part in parts(max(2, followed), job.batch):
         for base in job.lanes.bases:
             blocks = range(base + part.start, base + part.stop)
-            transmit(rows.take(blocks), job.basis.x, job.basis.y, passed.take(range(part.start, part.stop)))
+            loop(rows.take(blocks), job.basis.x, job.basis.y, passed.take(range(part.start, part.stop)))
     return passed.values
 
 
 def in_front(lanes: Lanes, passed: Float[Tensor, "G P L"], inside: Float[Tensor, "G P L"]) -> Float[Tensor, "G P L"]:
-    """Transmittance in front of every list: that behind the piece before it."""
+    """Returns the transmittance in front of every list: that behind the piece before it."""
     front = inside.clone()
     before, passing = front.mT, passed.mT
     for later, earlier in lanes.follows:
@@ -196,15 +205,14 @@ def in_front(lanes: Lanes, passed: Float[Tensor, "G P L"], inside: Float[Tensor,
 
 
 def behind_lists(job: Job, kept: Chunks, gradient: list[Float[Tensor, "G P L"]]) -> Float[Tensor, "G P L"]:
-    """The picture behind every list as seen from there, weighted by the gradient: what the pieces that follow show, by
-    the transmittance in front of them."""
+    """Returns the gradient-weighted picture behind every list: that of the pieces that follow it."""
     found = torch.zeros_like(gradient[0])
     if kept.pieces is None:
         return found
     behind, front, (passed, lights) = found.mT, kept.front.values.mT, kept.pieces
     for later, earlier in reversed(job.lanes.follows):
-        shown, seen = ([channel.mT[later] for channel in channels] for channels in (lights, gradient))
-        own = seen_from_front(shown, seen, front[later], job.rules)
+        light, weight = ([channel.mT[later] for channel in channels] for channels in (lights, gradient))
+        own = weighted_picture(light, weight, front[later], job.rules)
         behind[earlier] = own + passed.mT[later] * behind[later]
     return found
 
@@ -212,7 +220,7 @@ def behind_lists(job: Job, kept: Chunks, gradient: list[Float[Tensor, "G P L"]])
 def blend_chunks(
     job: Job, rows: Float[Tensor, "S K F L"], inside: Float[Tensor, "G P L"]
 ) -> tuple[list[Float[Tensor, "G P L"]], Chunks]:
-    """What every list adds to the channels and the coverage, front to back."""
+    """Returns (what every list adds to the channels and the coverage, values for the backward pass)."""
     held, front, pieces = Rows(rows), inside, None
     accumulated = [Rows(torch.zeros_like(inside)) for _ in range(job.rules.channels + 1)]
     lights = [channel.values for channel in accumulated]
@@ -220,11 +228,11 @@ def blend_chunks(
         passed = shares(job, held, inside)
         front, pieces = in_front(job.lanes, passed, inside), (passed, lights)
     kept = Chunks([], held, Rows(front), Rows(inside.new_empty(len(rows), *inside.shape[1:])), pieces)
-    blend = job.loops.blend
+    loop = compiled_loop(blend, job.rules)
     for batch in parts(len(inside), job.batch):
         number, left = 0, None
         while (stage := stage_of(job, number, batch, left)) is not None:
-            blend_stage(job, blend, stage, accumulated, kept)
+            blend_stage(job, loop, stage, accumulated, kept)
             kept.stages.append(stage)
             number += 1
             if number % CHECK_EVERY == 0:
@@ -234,8 +242,7 @@ def blend_chunks(
 
 
 def room_for_gradients(kept: Chunks, width: int) -> Float[Tensor, "S K L V"]:
-    """Room for `width` numbers of every entry, in the format of the rows; zero but where slices of blocks were
-    blended."""
+    """Allocates `width` numbers per entry, in the format of the rows; zero where no slice of blocks was blended."""
     rows, past = kept.rows.values, 0
     found = rows.new_empty(*rows.shape[:2], rows.shape[3], width)
     slices = sorted((s.blocks.start, s.blocks.stop) for s in kept.stages if isinstance(s.blocks, range))
@@ -247,14 +254,15 @@ def room_for_gradients(kept: Chunks, width: int) -> Float[Tensor, "S K L V"]:
 
 
 def chunk_gradients(job: Job, kept: Chunks, gradient: list[Float[Tensor, "G P L"]]) -> Float[Tensor, "S K L V"]:
-    """Gradient of every entry, back to front; zero for blocks that were not blended."""
-    seen, behind, basis = [Rows(channel) for channel in gradient], Rows(behind_lists(job, kept, gradient)), job.basis
+    """Returns the gradient of every entry, back to front; zero for blocks that were not blended."""
+    channels, behind, basis = [Rows(one) for one in gradient], Rows(behind_lists(job, kept, gradient)), job.basis
     found = Rows(room_for_gradients(kept, TABLE + job.rules.channels + 2 * job.rules.absolute))
-    gradients = job.loops.gradients
+    loop = compiled_loop(gradients, job.rules)
     for stage in reversed(kept.stages):
         rest, part = behind.take(stage.groups), found.take(stage.blocks)
-        given = kept.before(stage), rest, [channel.take(stage.groups) for channel in seen], part
-        gradients(kept.rows.take(stage.blocks), basis.x, basis.y, basis.products, *given)
+        weights = [channel.take(stage.groups) for channel in channels]
+        rows = kept.rows.take(stage.blocks)
+        loop(rows, basis.x, basis.y, basis.products, kept.before(stage), rest, weights, part)
         if not isinstance(stage.groups, range):
             behind.values[stage.groups], found.values[stage.blocks] = rest, part
     return found.values
@@ -264,16 +272,16 @@ def chunk_gradients(job: Job, kept: Chunks, gradient: list[Float[Tensor, "G P L"
 
 
 class CompiledComposite(torch.autograd.Function):
-    """See `composite_compiled` for the arguments."""
+    """Blends splats by chunks; `job`: their lists, in lanes."""
 
     @staticmethod
     def forward(ctx, means, conic_factors, log_opacities, channels, absgrad, intersections, job):
         places = places_of(job.lanes, intersections) if job.learning else None  # while the lists are in the cache
         table = padded_table(means, conic_factors, log_opacities, channels).to(job.precision.exact)
-        rows = job.loops.make_rows(table, job.lanes.entries, job.centre)
+        rows = compiled_loop(make_rows, job.rules)(table, job.lanes.entries, job.centre)
         inside = to_lanes(inside_of(job.grid, job.precision.accumulation, means.device), job.lanes)[0].clone()
         if job.learning and recording():  # later pictures may have lists that are cut
-            job.loops.transmit(rows[:2], job.basis.x, job.basis.y, inside.clone()[:2])
+            compiled_loop(transmit, job.rules)(rows[:2], job.basis.x, job.basis.y, inside.clone()[:2])
         accumulated, kept = blend_chunks(job, rows, inside)
         if job.learning:
             ctx.kept = (job, intersections, places, len(means), kept, absgrad is not None, means.dtype)
@@ -283,8 +291,8 @@ class CompiledComposite(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient):
         job, intersections, places, count, kept, absolute, dtype = ctx.kept
-        seen = to_lanes(job.grid.to_tiles(gradient.to(job.precision.accumulation)), job.lanes)
-        values = chunk_gradients(job, kept, seen).flatten(0, 2)
+        in_lanes = to_lanes(job.grid.to_tiles(gradient.to(job.precision.accumulation)), job.lanes)
+        values = chunk_gradients(job, kept, in_lanes).flatten(0, 2)
         total = sum_by_splat(values, intersections, places, count).to(dtype)
         width = TABLE + job.rules.channels
         absgrad = total[:, width:] if absolute else None
@@ -292,7 +300,7 @@ class CompiledComposite(torch.autograd.Function):
 
 
 class CompiledCompositor:
-    """Blends through compiled loops, or as the eager compositor where only that one can; a `Compositor`."""
+    """A `Compositor` of compiled loops; the eager one where it alone can draw."""
 
     backend = COMPILED
 
@@ -310,28 +318,17 @@ class CompiledCompositor:
         if not available(device):
             warn_once(device)
             return composite_eager(screen, channels, intersections, grid, settings)
-        return composite_compiled(screen, channels, intersections, grid, settings), None
-
-
-def composite_compiled(
-    screen: ScreenSplats,
-    channels: Float[Tensor, "M C"],
-    intersections: TileIntersections,
-    grid: TileGrid,
-    settings: RasterSettings,
-) -> Float[Tensor, "C_plus_1 H W"]:
-    """Blends like `composite`, through compiled loops. There must be a pair."""
-    means, absgrad = screen.means, screen.absgrad
-    precision = Precision.of(settings, means.dtype)
-    rules = rules_of(settings, channels.shape[1], absgrad is not None, precision.evaluation, means.device.type)
-    values = settings.compiled_values or (VALUES if means.device.type == "cpu" else VALUES_OF_A_GPU)
-    inputs = means, screen.conic_factors, screen.log_opacities, channels
-    if settings.schedule == "segments" or (settings.schedule == "auto" and means.device.type != "cpu"):
-        segments = cut(intersections, len(means), settings.unrolled)
-        work = segment_job(segments, grid, rules, precision, values, means.device)
-        return SegmentComposite.apply(padded_table(*inputs), absgrad, intersections, work)
-    job = chunk_job(intersections, grid, rules, precision, values, (*inputs, absgrad))
-    return CompiledComposite.apply(*inputs, absgrad, intersections, job)
+        means, absgrad = screen.means, screen.absgrad
+        precision = Precision.of(settings, means.dtype)
+        rules = rules_of(settings, channels.shape[1], absgrad is not None, precision.evaluation, device)
+        values = settings.compiled_values or (VALUES if device == "cpu" else VALUES_OF_A_GPU)
+        inputs = means, screen.conic_factors, screen.log_opacities, channels
+        if settings.schedule == "segments" or (settings.schedule == "auto" and device != "cpu"):
+            segments = cut(intersections, len(means), settings.unrolled)
+            work = segment_job(segments, grid, rules, precision, values, means.device)
+            return SegmentComposite.apply(padded_table(*inputs), absgrad, intersections, work), None
+        job = chunk_job(intersections, grid, rules, precision, values, (*inputs, absgrad))
+        return CompiledComposite.apply(*inputs, absgrad, intersections, job), None
 
 
 def chunk_job(
@@ -342,7 +339,7 @@ def chunk_job(
     values: int,
     inputs: Sequence[Tensor | None],
 ) -> Job:
-    """Lays lists out in lanes; `values`: alphas at once; `inputs`: means first, and what else gets a gradient."""
+    """Lays lists out in lanes; `values`: alphas at once; `inputs`: means first, then all else that gets a gradient."""
     means = inputs[0]
     assert means is not None
     batch = max(2, values // (rules.chunk * rules.tile_size**2 * LANES))
@@ -355,7 +352,6 @@ def chunk_job(
         grid=grid,
         basis=basis_of(rules.tile_size, exact.dtype, exact.device),
         centre=centres(lanes, grid, exact),
-        loops=kernels(rules),
         rules=rules,
         precision=precision,
         batch=batch,
@@ -367,7 +363,7 @@ def chunk_job(
 def warn_once(device: str) -> None:
     """Logs why the eager compositor draws instead."""
     logger.warning(
-        "rasterizer.path=compiled: nothing can be compiled here (%s); going on with the eager path, which is several "
-        "times slower. Install a C++ compiler (g++ or clang++), or choose rasterizer=eager",
+        "rasterizer.path=compiled: nothing can be compiled here (%s); using the eager path, several times slower. "
+        "Install a C++ compiler (g++ or clang++), or set rasterizer=eager",
         complaint(device),
     )

@@ -1,4 +1,4 @@
-"""Whether anything can be compiled on this machine, and compiling for sizes that vary."""
+"""torch.compile for sizes that vary, and a test of the compiler on this machine."""
 
 import functools
 import os
@@ -11,33 +11,33 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from gsx.core.errors import CompilerError, first_line
-from gsx.engine.compile_cache import KeptFunction, flat, record, recording
+from gsx.engine.compile_cache import CachedFunction, flat, record, recording
 
 Result = TypeVar("Result")
 Varying: TypeAlias = Callable[[tuple[Any, ...]], list[tuple[Tensor, int]]]
-"""Sizes (tensor, axis) of arguments that may differ at the next call."""
+"""Lists sizes (tensor, axis) of arguments that may differ at the next call."""
 
 OWN_INDICES: dict[str, Any] = {"assert_indirect_indexing": False}
-"""Option of the compiler: indices are not checked, since all are computed here."""
+"""Compiler option: no checks of indices, since all are computed here."""
 CONTRACT = "cpp.enable_floating_point_contract_flag"
 CONTRACTED: dict[str, Any] = {CONTRACT: "fast"}
-"""Option of the compiler on a CPU: products and sums contract."""
+"""Compiler option on a CPU: products and sums contract."""
 ROWS_ALIKE: dict[str, Any] = {CONTRACT: "off"}
-"""The same for functions of rows, which do not contract: the last rows, too few for a vector, have code of their own,
-in which the C++ compiler contracts others, and no splat may depend on how many there are."""
+"""The same for functions of rows, which do not contract: the last rows, too few for a vector, have separate code, in
+which the C++ compiler contracts others, and no splat may depend on the number of splats."""
 IN_VECTORS: dict[str, Any] = {"cpp.enable_tiling_heuristics": False}
-"""Option of the compiler: vectors also take rows whose numbers lie side by side; found by trying."""
+"""Compiler option: vectors also of rows whose numbers are contiguous; measured to be faster."""
 WHOLE_LOOPS: dict[str, Any] = OWN_INDICES | {
     "max_fusion_size": 4096,
     "cpp.max_horizontal_fusion_size": 4096,
     "cpp.dynamic_threads": True,
 }
-"""Options of the compiler: an unrolled loop stays in one piece; indices are not checked."""
+"""Compiler options: an unrolled loop stays in one piece; no checks of indices."""
 
 
 @functools.lru_cache
 def complaint(device: str) -> str:
-    """Says why nothing can be compiled for a device, by compiling a few operations; empty where it can be."""
+    """Compiles a few operations for a device; returns why that fails, or an empty text."""
     try:
         compile_rows(test_of_the_compiler)(torch.ones(32, device=device))
     except Exception as error:  # a missing compiler, a broken one, a read-only cache: all mean eager
@@ -46,7 +46,7 @@ def complaint(device: str) -> str:
 
 
 def reason_of(error: BaseException) -> str:
-    """Says in one line why torch could not compile: the C++ compiler's words, or those of torch's backend."""
+    """Extracts one line of why torch could not compile: the C++ compiler's message, or that of torch's backend."""
     parts = (str(error).partition(mark)[2].strip() for mark in ("Output:\n", "raised:\n"))
     return next(filter(None, parts), first_line(error)).splitlines()[0]
 
@@ -57,7 +57,7 @@ def test_of_the_compiler(x: Tensor) -> Tensor:
 
 
 def available(device: str = "cpu") -> bool:
-    """Checks whether torch.compile works on this machine; assumes so where calls are only recorded."""
+    """Checks that torch.compile works on this machine; True where calls are only recorded."""
     return recording() or not complaint(device)
 
 
@@ -70,8 +70,8 @@ def with_last(function: Callable[..., Any], *values: Any) -> Callable[..., Any]:
 def compile_rows(function: Callable[..., Any], *last: Any, options: dict[str, Any] | None = None) -> Callable[..., Any]:
     """Compiles `function` once for any number of rows, with these values of its last arguments.
 
-    Tensors with as many rows, or columns, as the first argument has rows vary in number. Every other size is a constant
-    of the code, which is faster and compiles sooner. There must be more than one row. `options`: of the compiler.
+    Rows, or columns, vary where they are as many as the first argument's rows, more than one. All other sizes are
+    constants of the code, which is faster and compiles sooner. `options`: of the compiler.
     """
 
     def varying(arguments: tuple[Any, ...]) -> list[tuple[Tensor, int]]:
@@ -88,20 +88,19 @@ def compiled_once(
     unchecked: Iterable[str] = (),
     fullgraph: bool = False,
 ) -> Callable[..., Any]:
-    """Compiles `function` of tensors once, whatever the sizes are that vary.
+    """Compiles `function` of tensors once, for all values of the sizes that vary.
 
-    On a CPU its code is kept on disk (compile_cache.py); elsewhere torch traces it in each process.
+    On a CPU its code is cached on disk (compile_cache.py); elsewhere torch traces it in each process.
 
     Args:
         options: of the compiler.
-        unchecked: types of torch's conditions that need no check.
-        fullgraph: whether torch raises what it would else leave to Python.
+        unchecked: types of torch's conditions to skip.
+        fullgraph: raise where torch would fall back to Python.
     """
-    left_out, chosen = set(unchecked), CONTRACTED | (options or {})
-    kept = KeptFunction(function, varying, chosen, left_out)
-    if left_out:
-        keep = {"guard_filter_fn": lambda guards: [guard.guard_type not in left_out for guard in guards]}
-        chosen = chosen | keep
+    skipped, chosen = set(unchecked), CONTRACTED | (options or {})
+    cached = CachedFunction(function, varying, chosen, skipped)
+    if skipped:
+        chosen = chosen | {"guard_filter_fn": lambda guards: [guard.guard_type not in skipped for guard in guards]}
 
     @functools.cache
     def traced() -> Callable[..., Any]:  # torch's compiler takes a second to import
@@ -111,9 +110,9 @@ def compiled_once(
         if Parameter in map(type, arguments):  # torch always takes their sizes for constants
             arguments = tuple(a.view_as(a) if type(a) is Parameter else a for a in arguments)
         if flat(arguments[:1])[0].is_cpu:
-            if record(kept, arguments):
+            if record(cached, arguments):
                 return function(*arguments)
-            code = kept.code_for(arguments)
+            code = cached.code_for(arguments)
             if code is not None:
                 return code.run(*arguments)
         return by_torch(traced, function.__name__, arguments)
@@ -125,7 +124,7 @@ def by_torch(traced: Callable[[], Callable[..., Any]], name: str, arguments: tup
     """Calls a function through torch.compile.
 
     Raises:
-        CompilerError: it cannot be compiled, though others could.
+        CompilerError: it cannot be compiled.
     """
     try:
         return traced()(*arguments)
@@ -134,14 +133,13 @@ def by_torch(traced: Callable[[], Callable[..., Any]], name: str, arguments: tup
             raise
         folder = os.environ.get("TORCHINDUCTOR_CACHE_DIR", "the folder for temporary files")
         raise CompilerError(
-            f"{name} cannot be compiled ({reason_of(error)}): see to space and memory, also in {folder}, and go on, or "
-            "give rasterizer=eager"
+            f"{name} cannot be compiled ({reason_of(error)}): free memory, and space in {folder}, or set "
+            "rasterizer=eager"
         ) from error
 
 
 def sizes_free(compiled: Callable[..., Any], varying: Varying) -> Callable[..., Any]:
-    """Marks the sizes that vary, at the first call with gradients of given arguments and at that without: torch
-    compiles these apart."""
+    """Marks the sizes that vary at the first call of each set of arguments with gradients: torch compiles each set."""
     marked: set[tuple[bool, ...]] = set()
 
     def call(*arguments: Any) -> Any:
@@ -162,7 +160,7 @@ def with_any_sizes(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def fused(function: Callable[..., Result]) -> Callable[..., Result]:
-    """Compiles `function` of tensors into few kernels on a GPU, where launches cost; a CPU runs it as it stands."""
+    """Compiles `function` of tensors into few kernels on a GPU, where launches cost; a CPU runs it uncompiled."""
 
     @functools.wraps(function)
     def call(*arguments: Any) -> Result:

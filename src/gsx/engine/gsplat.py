@@ -1,4 +1,4 @@
-"""Blends by the CUDA kernels of the package gsplat, where it is installed (`rasterizer=gsplat`)."""
+"""Blending by the CUDA kernels of the package gsplat, where it is installed (`rasterizer=gsplat`)."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ from gsx.engine.backend import COMPILED
 
 RULES = {"alpha_min": 1 / 255, "alpha_max": 0.999, "transmittance_stop": 1e-4}
 """Constants of its kernels (gsplat, RasterizeToPixels3DGSFwd.cu)."""
-OTHERWISE = "or choose rasterizer=auto"
+OTHERWISE = "or set rasterizer=auto"
 
 
 def rasterize_to_pixels() -> Callable[..., tuple[Tensor, Tensor]]:
@@ -36,7 +36,7 @@ def rasterize_to_pixels() -> Callable[..., tuple[Tensor, Tensor]]:
 
 
 class GsplatCompositor:
-    """Blends by gsplat; largest weights, float64 and empty pictures by the eager compositor. A `Compositor`."""
+    """A `Compositor` by gsplat; the eager compositor for largest weights, float64 and empty pictures."""
 
     backend = COMPILED
 
@@ -44,15 +44,15 @@ class GsplatCompositor:
         self.devices = devices
 
     def refuse(self, settings: RasterSettings, device: torch.device) -> None:
-        """Raises ConfigError where the package, a device or rules that its kernels have are missing."""
+        """Raises ConfigError if the package or a device is missing, or rules differ from its kernels' constants."""
         rasterize_to_pixels()
         if device.type not in self.devices:
             raise ConfigError(
-                f"rasterizer=gsplat draws on a CUDA device, not on {device}: give device=cuda, {OTHERWISE}"
+                f"rasterizer=gsplat draws on a CUDA device, not on {device}: set device=cuda, {OTHERWISE}"
             )
         for name, value in RULES.items():
-            if not math.isclose(asked := getattr(settings, name), value):
-                raise ConfigError(f"rasterizer.{name} is {asked}, but gsplat has {value:.6g}: give that, {OTHERWISE}")
+            if not math.isclose(setting := getattr(settings, name), value):
+                raise ConfigError(f"rasterizer.{name} is {setting}, but gsplat has {value:.6g}: set that, {OTHERWISE}")
 
     def __call__(
         self,
@@ -87,7 +87,7 @@ class GsplatCompositor:
 
 
 def gather_absolute(means: Float[Tensor, "1 M 2"], absgrad: Float[Tensor, "M 2"] | None) -> None:
-    """Copies what gsplat leaves at its means, in their attribute `absgrad`, into the gradient of ours."""
+    """Copies absolute gradients, which gsplat leaves in `means.absgrad`, into the gradient of `absgrad`."""
     if absgrad is None or not means.requires_grad:
         return
 

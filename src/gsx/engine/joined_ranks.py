@@ -1,6 +1,6 @@
 """One run on the processes of torchrun (docs/how-to/sweeps-and-clusters.md).
 
-A rank that leaves, for an error or at its end, says so in place of its next object, so that nobody waits for it in
+A rank that leaves, by an error or at its end, sends a `Departure` in place of its next object, so that no rank waits in
 vain; tensors are therefore exchanged only right after objects.
 """
 
@@ -21,7 +21,7 @@ from gsx.core.training.distributed import Ranks
 T = TypeVar("T")
 
 PATIENCE = timedelta(days=2)
-"""How long ranks wait for the first, which makes pseudo views and evaluates alone."""
+"""Longest wait of ranks for rank 0, which makes pseudo views and evaluates alone."""
 
 
 class Joined(Ranks):
@@ -56,7 +56,7 @@ class Joined(Ranks):
         return out
 
 
-# -- coming and going --------------------------------------------------------------------------------------------------
+# -- start and end -----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,9 +75,9 @@ def current_ranks() -> Ranks:
 
 
 def run_together(action: Callable[[], int], explain: Callable[[BaseException], int]) -> NoReturn:
-    """Runs an action with the other processes of torchrun, and ends with the exit code of the first, once all are done.
+    """Runs an action with the other processes of torchrun and exits with rank 0's code, once all are done.
 
-    `explain` shows an error and returns its code, or raises it again.
+    `explain` prints an error and returns its code, or raises it again.
     """
     gpus = torch.cuda.is_available() and dist.is_nccl_available()
     dist.init_process_group("cpu:gloo,cuda:nccl" if gpus else "gloo", timeout=PATIENCE)
@@ -93,7 +93,7 @@ def run_together(action: Callable[[], int], explain: Callable[[BaseException], i
 
 
 def end(code: int) -> NoReturn:
-    """Ends this process at once: while its interpreter is taken down, threads of the group now and then abort it."""
+    """Ends this process at once: threads of the group sometimes abort an interpreter that shuts down."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)
@@ -105,7 +105,7 @@ def leave(departure: Departure) -> int:
     try:
         while not all(isinstance(other, Departure) for other in received):
             received = exchange(departure)
-    except (TrainingError, KeyboardInterrupt):  # nobody is there to receive it, or nobody wants to wait
+    except (TrainingError, KeyboardInterrupt):  # another rank is gone, or the user stops waiting
         return departure.code
     return received[0].code
 
@@ -121,7 +121,6 @@ def exchange(value: Any) -> list[Any]:
         dist.all_gather_object(values, value)
     except RuntimeError as error:
         raise TrainingError(
-            "another process of this run exited unexpectedly (killed, perhaps for want of memory): go on with gsx "
-            "resume RUN, on all of them"
+            "another process of this run exited unexpectedly (out of memory?): run gsx resume RUN with all processes"
         ) from error
     return values

@@ -1,4 +1,4 @@
-"""Images that are expensive to make, kept in the cache between runs."""
+"""Images that are expensive to compute, cached between runs."""
 
 import functools
 import logging
@@ -21,12 +21,12 @@ def kept_image(path: Path) -> UInt8[Tensor, "C H W"] | None:
     try:
         return read_image(path)
     except InputError as error:
-        logger.warning("%s It is made again.", error)
+        logger.warning("%s Computing it again.", error)
         return None
 
 
 def keep_image(path: Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, "C H W"]) -> None:
-    """Keeps an image as PNG; a cache that cannot be written is no error."""
+    """Writes an image to the cache as PNG; warns if that fails."""
     try:
         make_folder(path.parent)
         write_image(path, image)
@@ -37,5 +37,5 @@ def keep_image(path: Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, "C H W"
 
 @functools.lru_cache(maxsize=16)
 def warn_once(problem: str) -> None:
-    """Warns once of what keeps images from being kept."""
-    logger.warning("%s; pictures are made again next time", problem)
+    """Warns once of a problem with the cache."""
+    logger.warning("%s; images are computed again next time", problem)

@@ -1,8 +1,8 @@
-"""The loops of the compiled path, in plain torch: what `torch.compile` turns into one fused loop each.
+"""The loops of the compiled path, in plain torch: `torch.compile` turns each into one fused loop.
 
-Every function works on B blocks of K entries and the P pixels of a tile: front to back in L lanes (see lanes.py), by
-segments without, where pixels lie side by side. The loop over the K entries is unrolled, but where light is found
-alone; sums over a tile's pixels are the only reductions in the others. Rules are constants of the compiled code.
+Every function works on B blocks of K entries and the P pixels of a tile: front to back in L lanes (lanes.py), or
+without lanes and with pixels contiguous (segments.py). The loop over the K entries is unrolled, except in `transmit`;
+elsewhere sums over a tile's pixels are the only reductions. Rules are constants of the compiled code.
 """
 
 import functools
@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from inspect import signature
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -23,19 +23,28 @@ from gsx.engine.compiling import WHOLE_LOOPS, compiled_once, with_last
 TABLE = 6
 """Columns of a splat's table before its channels: mean x, mean y, u0, u1, u2, ln opacity."""
 ROW = 7
-"""Columns of a row before its channels: five of its exponent, ln opacity, and where alpha is clamped."""
+"""Columns of a row before its channels: five of its exponent, ln opacity, and the largest alpha."""
 EXP_DEGREE = 7
-"""Degree of the polynomial for exp on a quarter (eighth, ...) of its range: relative error < 3e-7 but for rounding."""
+"""Degree of the polynomial for exp on a quarter (eighth, ...) of its range: relative error < 3e-7 before rounding."""
 EXP_TOP = 0.02
-"""Exponents are at most 0 but for rounding."""
+"""Upper end of the polynomial's range: exponents exceed 0 by rounding only."""
+
+Rows: TypeAlias = Float[Tensor, "B K F *L"]
+"""Columns of every entry, as `make_rows` returns them."""
+Entry: TypeAlias = Float[Tensor, "F B 1 *L"]
+"""Columns of one entry of every block."""
+Axis: TypeAlias = Float[Tensor, "P *one"]
+"""One coordinate of a tile's pixels, px from its middle."""
+Light: TypeAlias = Float[Tensor, "B P *L"]
+"""A number at every pixel of each block."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """Everything that compiled code depends on."""
+    """Constants of the compiled code."""
 
     tile_size: int
-    """Makes the number of pixels a constant of the code."""
+    """Sets the number of pixels."""
     chunk: int
     channels: int
     alpha_min: float
@@ -59,11 +68,11 @@ class Rules:
 
 @functools.lru_cache
 def exp_polynomial(least: float) -> tuple[tuple[float, ...], int]:
-    """Coefficients of p and a number q of squarings with exp(x) = p(x)^(2^q) on [least, EXP_TOP].
+    """Returns coefficients of p and a number q of squarings with exp(x) = p(x)^(2^q) on [least, EXP_TOP].
 
-    Least squares of the relative error at Chebyshev nodes, in float64, of x / 2^q, whose powers are of one size: those
-    of x are not where alpha_min is tiny. Exponents below `least` are cut off anyway, so no range reduction is needed:
-    this is twice as fast as a library's exp.
+    Least squares of the relative error at Chebyshev nodes, in float64, of x / 2^q: powers of x itself differ too much
+    in size where alpha_min is tiny. Exponents below `least` are cut off, so no range reduction is needed: twice as fast
+    as a library's exp.
     """
     low, squarings = least - 0.05, 0
     while (EXP_TOP - low) / 2**squarings > 1.5:
@@ -76,7 +85,7 @@ def exp_polynomial(least: float) -> tuple[tuple[float, ...], int]:
 
 
 def cut_exp(x: Tensor, rules: Rules) -> Tensor:
-    """exp(x) where x >= ln alpha_min, else 0."""
+    """Returns exp(x) where x >= ln alpha_min, else 0."""
     if x.dtype != torch.float32:
         return torch.where(x >= rules.least, torch.exp(x), 0.0)
     *others, highest = rules.powers
@@ -88,34 +97,32 @@ def cut_exp(x: Tensor, rules: Rules) -> Tensor:
     return torch.where(x >= rules.least, value, 0.0)
 
 
-def log_alpha(row: Float[Tensor, "F B 1 *L"], x: Float[Tensor, "P *one"], y: Float[Tensor, "P *one"]) -> Tensor:
-    """Returns ln alpha of one entry at every pixel, [B P *L]; the columns of a row are those of `make_rows`."""
+def log_alpha(row: Entry, x: Axis, y: Axis) -> Light:
+    """Returns ln alpha of one entry at every pixel."""
     u0, u1, k0, u2, k1, log_opacity = row[: ROW - 1]
     s, r = u0 * x + (u1 * y + k0), u2 * y + k1
     return log_opacity - r * r - s * s
 
 
-def gaussian(row: Tensor, x: Tensor, y: Tensor, rules: Rules) -> Tensor:
-    """o exp(-s^2 - r^2), zero below alpha_min, before the clamp at alpha_max; [B P *L]."""
+def gaussian(row: Entry, x: Axis, y: Axis, rules: Rules) -> Light:
+    """Returns o exp(-s^2 - r^2), zero below alpha_min, before the clamp at alpha_max."""
     row, x, y = row.to(rules.evaluation), x.to(rules.evaluation), y.to(rules.evaluation)
     return cut_exp(log_alpha(row, x, y), rules)
 
 
-def clamped(value: Tensor, row: Float[Tensor, "F B 1 *L"]) -> Tensor:
-    """min(value, highest), as a selection: cheaper than a minimum that honours NaN."""
+def clamped(value: Light, row: Entry) -> Light:
+    """Returns min(value, largest alpha) by a selection: cheaper than a minimum that honours NaN."""
     highest = row[ROW - 1].to(value.dtype)
     return torch.where(value > highest, highest, value)
 
 
-def passing(
-    row: Float[Tensor, "F B 1 *L"], x: Float[Tensor, "P *one"], y: Float[Tensor, "P *one"], rules: Rules
-) -> Tensor:
-    """1 - alpha of one entry at every pixel, [B P *L]."""
+def passing(row: Entry, x: Axis, y: Axis, rules: Rules) -> Light:
+    """Returns 1 - alpha of one entry at every pixel."""
     return 1 - clamped(gaussian(row, x, y, rules), row).to(row.dtype)
 
 
-def entries(rows: Float[Tensor, "B K F *L"]) -> list[Float[Tensor, "F B 1 *L"]]:
-    """The rows of each of the K entries."""
+def entries(rows: Rows) -> list[Entry]:
+    """Splits rows into the K entries."""
     return list(rows.movedim(0, 2)[:, :, :, None].unbind(0))
 
 
@@ -123,17 +130,11 @@ def entries(rows: Float[Tensor, "B K F *L"]) -> list[Float[Tensor, "F B 1 *L"]]:
 
 
 def blended(
-    rows: Float[Tensor, "B K F *L"],
-    x: Float[Tensor, "P *one"],
-    y: Float[Tensor, "P *one"],
-    before: Float[Tensor, "B P *L"],
-    sums: Sequence[Any],
-    rules: Rules,
-) -> tuple[Float[Tensor, "B P *L"], list[Tensor]]:
-    """(transmittance behind each block, `sums`, numbers or tensors, with what it adds to the channels and, last, the
-    coverage).
+    rows: Rows, x: Axis, y: Axis, before: Light, sums: Sequence[Any], rules: Rules
+) -> tuple[Light, list[Tensor]]:
+    """Returns (transmittance behind each block, `sums` plus its channels and, last, its coverage).
 
-    Transmittance goes on falling below the stop value, so that a pixel that has ended stays ended.
+    Transmittance keeps falling below the stop value, so that a pixel that has ended stays ended.
     """
     t, total = before, list(sums)
     for row in entries(rows):
@@ -145,18 +146,10 @@ def blended(
     return t, total
 
 
-def blend(
-    rows: Float[Tensor, "B K F *L"],
-    x: Float[Tensor, "P *one"],
-    y: Float[Tensor, "P *one"],
-    before: Float[Tensor, "B P *L"],
-    after: Float[Tensor, "B P *L"],
-    accumulated: list[Float[Tensor, "B P *L"]],
-    rules: Rules,
-) -> None:
-    """Blend one block of every group into `accumulated`, the channels and, last, the coverage.
+def blend(rows: Rows, x: Axis, y: Axis, before: Light, after: Light, accumulated: list[Light], rules: Rules) -> None:
+    """Blends one block of every group into `accumulated`: the channels and, last, the coverage.
 
-    `before` is the transmittance in front of the block, `after` receives that behind it.
+    `before` is the transmittance in front of the block; `after` receives that behind it.
     """
     t, sums = blended(rows, x, y, before, accumulated, rules)
     after.copy_(t)
@@ -164,56 +157,39 @@ def blend(
         target.copy_(value)
 
 
-def fade(
-    rows: Float[Tensor, "B K F *L"], x: Float[Tensor, "P *one"], y: Float[Tensor, "P *one"], rules: Rules
-) -> Float[Tensor, "B P *L"]:
-    """Share of the light that passes each block, without regard to where pixels end."""
-    passed = None
-    for row in entries(rows):
-        share = passing(row, x, y, rules)
-        passed = share if passed is None else passed * share
-    assert passed is not None
+def fade(rows: Rows, x: Axis, y: Axis, rules: Rules) -> Light:
+    """Returns the share of the light that passes each block, regardless of where pixels end."""
+    first, *others = entries(rows)
+    passed = passing(first, x, y, rules)
+    for row in others:
+        passed = passed * passing(row, x, y, rules)
     return passed
 
 
-def transmit(
-    rows: Float[Tensor, "B K F L"],
-    x: Float[Tensor, "P one"],
-    y: Float[Tensor, "P one"],
-    passed: Float[Tensor, "B P L"],
-    rules: Rules,
-) -> None:
-    """Leave of `passed` what passes one more block of every group. Its entries are not unrolled: light alone depends on
-    no order, and code for one of them compiles sooner."""
+def transmit(rows: Rows, x: Axis, y: Axis, passed: Light, rules: Rules) -> None:
+    """Multiplies `passed` by the transmittance of one more block of every group.
+
+    Its entries are not unrolled: light alone depends on no order, and such code compiles sooner.
+    """
     row = rows.movedim(2, 0)[..., None, :]  # [F B K 1 L], where others have [F B 1 L] of each entry
     passed.copy_(passed * passing(row, x, y, rules).prod(1))
 
 
-def seen_from_front(
-    lights: Sequence[Float[Tensor, "*B P"]],
-    gradient: Sequence[Float[Tensor, "*B P"]],
-    before: Float[Tensor, "*B P"],
-    rules: Rules,
-) -> Float[Tensor, "*B P"]:
-    """What shows by `lights`, channels and coverage, as seen from where the transmittance is `before`, weighted by the
-    gradient of the picture."""
+def weighted_picture(lights: Sequence[Tensor], gradient: Sequence[Tensor], before: Tensor, rules: Rules) -> Tensor:
+    """Returns lights . gradient / before: the gradient-weighted picture of `lights` for unit transmittance in front.
+
+    `lights`: channels and coverage; `before`: transmittance in front of them. All [*B P].
+    """
     shine = sum_of_products(lights, gradient)
     return torch.where(before >= max(rules.stop, torch.finfo(before.dtype).tiny), shine / before, 0.0)
 
 
 def slopes(
-    rows: Float[Tensor, "B K F *L"],
-    x: Float[Tensor, "P *one"],
-    y: Float[Tensor, "P *one"],
-    before: Float[Tensor, "B P *L"],
-    behind: Float[Tensor, "B P *L"],
-    gradient: list[Float[Tensor, "B P *L"]],
-    rules: Rules,
-) -> tuple[list[Float[Tensor, "B P *L"]], list[Float[Tensor, "B P *L"]], Float[Tensor, "B P *L"]]:
-    """d loss / d ln alpha of each entry at every pixel, the blending weight of each, and what `behind` is in front of
-    the block.
+    rows: Rows, x: Axis, y: Axis, before: Light, behind: Light, gradient: list[Light], rules: Rules
+) -> tuple[list[Light], list[Light], Light]:
+    """Returns (d loss / d ln alpha of each entry, its blending weight, `behind` moved in front of the block).
 
-    `behind` is the picture behind the block as seen from there, weighted by the gradient; with it the slope is weight
+    `behind` is the gradient-weighted picture behind the block (`weighted_picture`); with it the slope is weight
     (channels . gradient - behind): no division, and no difference of large sums. Multiplied front to back, last: the
     compiler makes faster code of that order.
     """
@@ -237,19 +213,19 @@ def slopes(
 
 
 def sums_of(
-    rows: Float[Tensor, "B K F *L"],
+    rows: Rows,
     slope: Float[Tensor, "B K P *L"],
     weight: Float[Tensor, "B K P *L"],
-    x: Float[Tensor, "P *one"],
-    y: Float[Tensor, "P *one"],
+    x: Axis,
+    y: Axis,
     products: Float[Tensor, "3 P *one"],
-    gradient: list[Float[Tensor, "B P *L"]],
+    gradient: list[Light],
     rules: Rules,
 ) -> Float[Tensor, "B K V *L"]:
-    """Sums over a tile's pixels of slope d and weight for every entry.
+    """Sums slope d and weight of every entry over a tile's pixels.
 
-    The V columns: d, d x, d y, d x^2, d x y, d y^2, weight times gradient per channel and, if asked, the absolute
-    gradient of the mean per axis.
+    The V columns: d, d x, d y, d x^2, d x y, d y^2, weight times gradient per channel and, if `rules.absolute`, the
+    absolute gradient of the mean per axis.
     """
     sums = [slope.sum(2), *((slope * b).sum(2) for b in (x, y, *products.unbind(0)))]
     sums += [(weight * g[:, None]).sum(2) for g in gradient[:-1]]
@@ -259,20 +235,20 @@ def sums_of(
 
 
 def gradients(
-    rows: Float[Tensor, "B K F *L"],
-    x: Float[Tensor, "P *one"],
-    y: Float[Tensor, "P *one"],
+    rows: Rows,
+    x: Axis,
+    y: Axis,
     products: Float[Tensor, "3 P *one"],
-    before: Float[Tensor, "B P *L"],
-    behind: Float[Tensor, "B P *L"],
-    gradient: list[Float[Tensor, "B P *L"]],
+    before: Light,
+    behind: Light,
+    gradient: list[Light],
     out: Float[Tensor, "B K *L V"],
     rules: Rules,
 ) -> None:
-    """What `entry_gradients` makes of sums of what `slopes` finds, into `out`; `behind` is moved in front of the
-    blocks. All are loops of one call: calls cost, and there are hundreds in a step.
+    """Writes the gradients of entries to `out` and moves `behind` in front of the blocks.
 
-    Slopes and weights lie in one tensor: so the compiler sums both in one loop, and sums in parallel keep a core busy.
+    One call for all loops: calls cost, and a step makes hundreds. Slopes and weights lie in one tensor: so the compiler
+    sums both in one loop, and parallel sums keep a core busy.
     """
     by_entry, weights, rest = slopes(rows, x, y, before, behind, gradient, rules)
     behind.copy_(rest)
@@ -280,10 +256,8 @@ def gradients(
     out.copy_(entry_gradients(rows, sums_of(rows, slope, weight, x, y, products, gradient, rules), rules))
 
 
-def absolute_moments(
-    rows: Float[Tensor, "B K F *L"], slope: Float[Tensor, "B K P *L"], x: Tensor, y: Tensor
-) -> list[Float[Tensor, "B K *L"]]:
-    """Sums over pixels of |d loss / d mean| per axis: minus the slope of ln alpha along x and y."""
+def absolute_moments(rows: Rows, slope: Float[Tensor, "B K P *L"], x: Axis, y: Axis) -> list[Float[Tensor, "B K *L"]]:
+    """Sums |d loss / d mean| over pixels, per axis: minus the slope of ln alpha along x and y."""
     u0, u1, k0, u2, k1 = (column[:, :, None] for column in rows[:, :, :5].unbind(2))
     s, r = u0 * x + u1 * y + k0, u2 * y + k1
     by_x, by_y = 2 * u0 * s, 2 * (u1 * s + u2 * r)
@@ -296,10 +270,10 @@ def absolute_moments(
 def make_rows(
     table: Float[Tensor, "N F"], places: Int[Tensor, "S K *L"], centre: Float[Tensor, "S 2 1 *L"], rules: Rules
 ) -> Float[Tensor, "S K F *L"]:
-    """Gathers what blending reads of every entry.
+    """Gathers the columns of every entry from the table of splats, whose last row draws nothing.
 
     Columns: u0, u1, k0, u2, k1 of ln alpha = ln o - (u0 x + u1 y + k0)^2 - (u2 y + k1)^2 in tile-centred coordinates;
-    ln o; the largest alpha; the channels; the mean. `table`: mean x, mean y, u0, u1, u2, ln o, channels of every splat.
+    ln o; the largest alpha; the channels; the mean. `table`: mean x, mean y, u0, u1, u2, ln o, channels.
     """
     columns = [table[places, f] for f in range(table.shape[1])]
     x, y = columns[0] - centre[:, 0], columns[1] - centre[:, 1]
@@ -312,8 +286,7 @@ def make_rows(
 def entry_gradients(
     rows: Float[Tensor, "S K F *L"], moments: Float[Tensor, "S K V *L"], rules: Rules
 ) -> Float[Tensor, "S K *L V"]:
-    """Gradient of (mean x, mean y, u0, u1, u2, ln o, channels ...) for every entry from its moments, numbers of an
-    entry side by side."""
+    """Returns the gradient of (mean x, mean y, u0, u1, u2, ln o, channels ...) of every entry from its moments."""
     columns = rows.unbind(2)
     (x, y), u0, u1, u2 = columns[-2:], columns[0], columns[1], columns[3]
     k0, k1 = -(u0 * x + u1 * y), -u2 * y
@@ -328,58 +301,45 @@ def entry_gradients(
 # -- compilation ---------------------------------------------------------------------------------------------------
 
 SHARING = {"transmit": 30, "blend": 30, "gradients": 25}
-"""Of the loops over blocks: operations after which the compiler shares an intermediate value instead of repeating it.
+"""Operations after which the compiler shares an intermediate value instead of repeating it, by loop over blocks.
 
-Found by trying: other numbers cut a loop into several that talk through memory (`gradients` at 30 or 36: ten times as
+Measured: other numbers cut a loop into several that exchange data through memory (`gradients` at 30 or 36: ten times as
 slow) or take longer to compile (at 120: twice as long, for code that is no faster).
 """
 
 SHARED_AFTER = 50
-"""The same of all others: with more of them slopes by segments find weights twice."""
+"""The same for all other loops: above it, slopes of segments compute weights twice."""
 SUMS = {"gradients", "entry_sums"}
-"""Loops whose code differs where absolute gradients are asked for."""
+"""Loops whose code differs with `Rules.absolute`."""
 OF_A_TILE = {"x", "y", "products"}
-"""Arguments whose number of rows does not vary: that of all others is a number of blocks, splats or tiles."""
+"""Arguments with a fixed number of rows: that of all others is a number of blocks, splats or tiles."""
 
 
 def thresholds() -> list[str]:
-    """The compiler's options that say when a value is shared: CPUs have one of their own since torch 2.12."""
+    """Lists the compiler's options that set when a value is shared: CPUs have their own since torch 2.12."""
     names = ("realize_opcount_threshold", "realize_cpu_opcount_threshold")
     return [name for name in names if name in torch._inductor.list_options()]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Kernels:
-    """The compiled loops of one set of rules."""
-
-    transmit: Callable[..., None]
-    blend: Callable[..., None]
-    gradients: Callable[..., None]
-    make_rows: Callable[..., Tensor]
+def compiled_loop(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
+    """Returns `loop` by these rules through torch.compile; it compiles at its first call, for any number of blocks."""
+    return compile_loop(loop, rules if loop.__name__ in SUMS else replace(rules, absolute=False))
 
 
-@functools.lru_cache
-def kernels(rules: Rules) -> Kernels:
-    """Compiled loops for these rules; each compiles at its first call, for any number of blocks."""
-    loops = (transmit, blend, gradients, make_rows)
-    return Kernels(**{loop.__name__: compiled(loop, rules) for loop in loops})
-
-
-def compiled(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
-    """`loop` of these rules through torch.compile."""
-    if loop.__name__ not in SUMS:
-        rules = replace(rules, absolute=False)
+@functools.cache
+def compile_loop(loop: Callable[..., Any], rules: Rules) -> Callable[..., Any]:
+    """Compiles `loop` once by these rules."""
     options: dict[str, Any] = WHOLE_LOOPS | dict.fromkeys(thresholds(), SHARING.get(loop.__name__, SHARED_AFTER))
     # loops over blocks: no conditions on symbols, which are the number of blocks, the same in all arguments, and where
     # in storage a view begins, which enters no code; every other size, dtypes, strides and devices are checked one by
     # one, and 32-bit indices suffice (RasterSettings.compiled_values)
     unchecked = {"SHAPE_ENV"} if loop.__name__ in SHARING else set()
-    # what is checked then is not asserted once more by the code itself, which costs a quarter of a call
+    # the code need not assert again what is checked before: that costs a quarter of a call
     options |= {"size_asserts": False}
     names = [name for name in signature(loop).parameters if name != "rules"]
 
     def varying(arguments: tuple[Tensor | list[Tensor], ...]) -> list[tuple[Tensor, int]]:
-        given = flat(value for name, value in zip(names, arguments, strict=True) if name not in OF_A_TILE)
-        return [(tensor, 0) for tensor in given]
+        tensors = flat(value for name, value in zip(names, arguments, strict=True) if name not in OF_A_TILE)
+        return [(tensor, 0) for tensor in tensors]
 
     return compiled_once(with_last(loop, rules), varying, options, unchecked, fullgraph=True)

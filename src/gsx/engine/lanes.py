@@ -5,8 +5,8 @@ K entries of all groups, then the next K of those groups that have more, and so 
 so each chunk is a contiguous slice that begins at the first group. A pixel of a group is a vector of L values, and
 sums over a tile's pixels need no shuffling between lanes.
 
-Chunks follow each other, and each is a call, which costs as much as a dozen groups: where a few tiles have much longer
-lists than all others, those are cut into pieces that lie beside the lists of other tiles.
+Each chunk is a call, which costs as much as a dozen groups: where a few tiles have much longer lists than all others,
+those are cut into pieces, which fill lanes as the lists of other tiles do.
 """
 
 from dataclasses import dataclass
@@ -24,16 +24,15 @@ from gsx.core.shapes import Float, Int
 LANES = 16
 """Lists of a group: a 512-bit register of float32."""
 LONG = 8
-"""One in so many lists may be longer than where they are cut."""
+"""One in this many lists may be longer than the cut."""
 WORTH_CUTTING = 1.5
-"""Long lists are cut where the longest has more than so many times the chunks at which they would be: all light must be
-found twice in what is cut, but for the last pieces."""
+"""Long lists are cut if the longest has more than this many times the chunks of a piece: light is computed twice in all
+pieces but the last."""
 MOST_PIECES = 8
-"""Of a list: each is an operation of its own where light is handed from piece to piece."""
-
+"""Most pieces of a list: each costs an operation that hands light on to the next."""
 
 Places: TypeAlias = tuple[Int[Tensor, "_"], Int[Tensor, "_"]]
-"""Groups of some lists, and their lanes there."""
+"""Groups and lanes of some lists."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,7 +40,7 @@ class Lanes:
     """G groups of L lists and their S blocks."""
 
     tiles: Int[Tensor, "G L"]
-    """Tile of each lane's list; T, one past the last, fills the last group up."""
+    """Tile of each lane's list; T, one past the last, for empty lanes of the last group."""
     pairs: Int[Tensor, "S K L"]
     """Pair of each entry, pairs sorted by tile; P, one past the last, behind the end of a list."""
     entries: Int[Tensor, "S K L"]
@@ -63,7 +62,7 @@ class Lists:
 
     tiles: Int[Tensor, "N"]
     number: Int[Tensor, "N"]
-    """Which piece of its tile's list each is, from 0."""
+    """Number of each piece within its tile's list, from 0."""
     begin: Int[Tensor, "N"]
     """Its first pair."""
     end: Int[Tensor, "N"]
@@ -71,7 +70,7 @@ class Lists:
 
 
 def lists_of(starts: Int[Tensor, "T_1"], chunk: int, cut_long: bool) -> Lists:
-    """Lists of all tiles; long ones are cut at whole chunks, or none."""
+    """Returns the lists of all tiles; `cut_long` cuts long ones at whole chunks."""
     lengths = starts.diff()
     size = chunks_at_most(lengths, chunk) * chunk if cut_long else int(lengths.max())
     pieces = torch.div(lengths + (size - 1), size, rounding_mode="floor")
@@ -82,7 +81,7 @@ def lists_of(starts: Int[Tensor, "T_1"], chunk: int, cut_long: bool) -> Lists:
 
 
 def chunks_at_most(lengths: Int[Tensor, "T"], chunk: int) -> int:
-    """Chunks of a piece: as many as the longest list has where cutting is not worth it. One list is not empty."""
+    """Returns the chunks of a piece: those of the longest list if cutting is not worth it. One list is not empty."""
     ranked = lengths[lengths > 0].sort(descending=True).values
     longest, usual = (-(-ranked[[0, len(ranked) // LONG]] // chunk)).tolist()
     usual = max(usual, -(-longest // MOST_PIECES))
@@ -90,13 +89,11 @@ def chunks_at_most(lengths: Int[Tensor, "T"], chunk: int) -> int:
 
 
 def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: int, *, cut_long: bool) -> Lanes:
-    """Lay the lists of all tiles that have one out in lanes; `splats` is the number M of screen splats.
+    """Lays the lists of all tiles that have one out in lanes; `splats` is the number M of screen splats.
 
-    Sums over pieces of a list differ from those over the whole by their rounding, and what is cut depends on all lists
-    of a picture: where a crop is to show the bits of the whole, lists are not cut.
-
-    The first two groups of every `batch` groups get equally many chunks, and no batch has a single group: torch
-    specialises on sizes of one.
+    Sums over pieces of a list round differently from those over the whole, and the cuts depend on all lists of a
+    picture: no lists are cut where a crop must have the bits of the whole. The first two groups of every `batch` groups
+    get equally many chunks, and no batch has a single group: torch specialises on sizes of one.
     """
     lists, last = lists_of(intersections.starts, chunk, cut_long), len(intersections.starts) - 1
     lanes, longest = by_length(lists.end - lists.begin)
@@ -121,8 +118,7 @@ def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: in
 
 
 def by_length(lengths: Int[Tensor, "N"]) -> tuple[Int[Tensor, "G L"], Int[Tensor, "G"]]:
-    """Lists in groups, longest first, N where there is none; and the longest list of each group. At least two
-    groups."""
+    """Returns (lists in groups, longest first, N for none; longest list of each group). At least two groups."""
     lengths, order = torch.sort(lengths, descending=True, stable=True)
     count = max(2, -(-len(order) // LANES)) * LANES
     lanes = pad(order, (0, count - len(order)), value=len(order))
@@ -130,7 +126,7 @@ def by_length(lengths: Int[Tensor, "N"]) -> tuple[Int[Tensor, "G L"], Int[Tensor
 
 
 def pieces_of(lists: Lists, lanes: Int[Tensor, "G L"]) -> list[tuple[Places, Places]]:
-    """`Lanes.follows`."""
+    """Returns `Lanes.follows`."""
     rank = torch.empty_like(lists.tiles)
     rank[lanes.view(-1)[: len(rank)]] = torch.arange(len(rank), device=rank.device)
 
@@ -149,8 +145,10 @@ def pairs_in_blocks(
     chunks: Int[Tensor, "S"],
     chunk: int,
 ) -> Int[Tensor, "S K L"]:
-    """Pair of every entry: those of a list follow each other; `count`, one past the last, behind its end. With what
-    fills blocks up they stay below 2^31, since max_pairs is at most 2^30."""
+    """Returns the pair of every entry: consecutive in a list; `count`, one past the last, behind its end.
+
+    With padding they stay below 2^31, since max_pairs is at most 2^30.
+    """
     edges = (pad(side.int(), (0, 1), value=count) for side in (lists.begin, lists.end))
     begin, end = (side[lanes].index_select(0, groups) for side in edges)
     first = begin + (chunks * chunk).int()[:, None]
@@ -159,7 +157,7 @@ def pairs_in_blocks(
 
 
 def places_of(lanes: Lanes, intersections: TileIntersections) -> Int[Tensor, "P"]:
-    """Entry of each pair, pairs sorted by splat."""
+    """Returns the entry of each pair, pairs sorted by splat."""
     pairs, count = lanes.pairs.view(-1), len(intersections.slots)
     slots = pad(intersections.slots, (0, 1), value=count).index_select(0, pairs)
     places = torch.arange(len(pairs), device=pairs.device, dtype=torch.int32)
@@ -167,19 +165,19 @@ def places_of(lanes: Lanes, intersections: TileIntersections) -> Int[Tensor, "P"
 
 
 def centres(lanes: Lanes, grid: TileGrid, like: Tensor) -> Float[Tensor, "S 2 1 L"]:
-    """Middle of the tile of every block's lanes on the frame, px."""
+    """Returns the middle of the tile of every block's lanes on the frame, px."""
     positions = grid.centres(lanes.tiles.view(-1), like).view(*lanes.tiles.shape, 2)
     return positions[lanes.groups].permute(0, 2, 1)[:, :, None].contiguous()
 
 
 def to_lanes(tiles: Float[Tensor, "T C P"], lanes: Lanes) -> list[Float[Tensor, "G P L"]]:
-    """Each channel of a picture cut into tiles, in lanes."""
+    """Returns each channel of a picture cut into tiles, in lanes."""
     padded = torch.cat([tiles, tiles.new_zeros(1, *tiles.shape[1:])])
     return list(padded[lanes.tiles].permute(2, 0, 3, 1).contiguous().unbind(0))
 
 
 def from_lanes(channels: list[Float[Tensor, "G P L"]], lanes: Lanes, count: int) -> Float[Tensor, "T P C"]:
-    """Tiles of a picture from channels in lanes, pieces of a list added up; tiles without a list are zero."""
+    """Returns tiles of a picture from channels in lanes, pieces of a list added up; tiles without a list are zero."""
     picture = channels[0].new_zeros(len(channels), count + 1, channels[0].shape[1])
     tiles = lanes.tiles.clone() if lanes.follows else lanes.tiles
     for later, _ in lanes.follows:

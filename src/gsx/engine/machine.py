@@ -1,4 +1,4 @@
-"""Processor and GPU: their names, and on what compiled code and the last bits of results depend."""
+"""Processor and GPU: names, and stamps of all that compiled code and the last bits of results depend on."""
 
 import functools
 import platform
@@ -21,7 +21,7 @@ def device_name(device: torch.device) -> str:
 
 @functools.cache
 def processor_fields() -> dict[str, str]:
-    """Reads what Linux says of the first processor, by field; empty on other systems."""
+    """Reads Linux's description of the first processor, by field; empty on other systems."""
     try:
         first = PROCESSORS.read_text(errors="replace").split("\n\n")[0]
     except OSError:
@@ -37,7 +37,7 @@ def processor_kind() -> tuple[str, ...]:
 
 
 def machine_stamp(device: torch.device) -> tuple[object, ...]:
-    """Identifies what decides, beside code and settings, on the last bits of a result: torch, threads, device."""
+    """Identifies torch, threads and device: besides code and settings, the last bits of a result depend on them."""
     kind = device_name(device) if device.type == "cuda" else processor_kind()
     return torch.__version__, torch.get_num_threads(), kind
 
@@ -47,5 +47,5 @@ def multiplies_bfloat16(device: torch.device) -> bool:
     if device.type == "cuda":
         with torch.cuda.device(device):
             return torch.cuda.is_bf16_supported(including_emulation=False)
-    abilities: dict[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()  # empty where torch cannot tell
+    abilities: dict[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()  # empty: unknown
     return device.type == "cpu" and any(abilities.get(name, False) for name in ("amx_bf16", "avx512_bf16"))

@@ -1,4 +1,4 @@
-"""The processes of one run as torchrun numbers them, and the one that speaks. Without torch."""
+"""The processes of one run as torchrun numbers them, and which of them writes messages. Imports no torch."""
 
 import os
 import sys

@@ -1,11 +1,14 @@
-"""The segment schedule: blocks of all tiles at once, in few large kernels, which is what a GPU wants.
+"""The segment schedule: blocks of all tiles at once, in few large kernels, as a GPU needs it.
 
-The share of light that passes each block comes first; an associative scan makes of it the transmittance before every
-block; then all blocks are blended at once, and summed by tile. On the way back the scan runs from behind.
+The share of light that passes each block comes first; an associative scan turns it into the transmittance before every
+block; then all blocks are blended at once, and summed by tile. The backward pass scans from behind. A block belongs to
+one tile, whose gradient is read by the tile's number; pixels are contiguous, so that neighbouring threads read the same
+entry.
 """
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -16,11 +19,79 @@ from gsx.core.rasterizer.intersections import TileIntersections, sum_by_splat
 from gsx.core.rasterizer.settings import Precision
 from gsx.core.shapes import Float, Int
 from gsx.engine.compiling import fused
-from gsx.engine.kernels import TABLE, Rules
-from gsx.engine.segment_kernels import SegmentKernels, segment_kernels
+from gsx.engine.kernels import (
+    TABLE,
+    Rules,
+    blended,
+    compiled_loop,
+    entry_gradients,
+    fade,
+    make_rows,
+    slopes,
+    sums_of,
+    weighted_picture,
+)
 
 LEAST_BLOCKS = 2
 """torch compiles anew for a single one."""
+
+Rows: TypeAlias = Float[Tensor, "S K F"]
+"""Columns of every entry (`kernels.make_rows`)."""
+Light: TypeAlias = Float[Tensor, "S P"]
+"""A number at every pixel of each block."""
+Blocks: TypeAlias = Int[Tensor, "S"]
+"""A number of each block."""
+
+
+# -- loops ---------------------------------------------------------------------------------------------------------
+
+
+def light(rows: Rows, before: Light, x: Tensor, y: Tensor, rules: Rules) -> list[Light]:
+    """Returns what each block adds to each channel and, last, to the coverage."""
+    return blended(rows, x, y, before, [0.0] * (rules.channels + 1), rules)[1]
+
+
+def block_picture(
+    lights: list[Light], before: Light, tiles: Blocks, gradient: Float[Tensor, "T C_1 P"], rules: Rules
+) -> Light:
+    """Returns the gradient-weighted picture of each block alone."""
+    return weighted_picture(lights, gradient[tiles].unbind(1), before, rules)
+
+
+def entry_slopes(
+    rows: Rows,
+    before: Light,
+    behind: Light,
+    tiles: Blocks,
+    gradient: Float[Tensor, "T C_1 P"],
+    x: Tensor,
+    y: Tensor,
+    rules: Rules,
+) -> Float[Tensor, "S 2_K P"]:
+    """Returns `slopes` of every entry at every pixel, then the weights.
+
+    In one tensor: for few entries the compiler would otherwise compute each of them from the rows again.
+    """
+    slope, weight, _ = slopes(rows, x, y, before, behind, list(gradient[tiles].unbind(1)), rules)
+    return torch.stack([*slope, *weight], 1)
+
+
+def entry_sums(
+    rows: Rows,
+    found: Float[Tensor, "S 2_K P"],
+    tiles: Blocks,
+    gradient: Float[Tensor, "T C_1 P"],
+    x: Tensor,
+    y: Tensor,
+    products: Float[Tensor, "3 P"],
+    rules: Rules,
+) -> Float[Tensor, "S K V"]:
+    """Returns `sums_of` the slopes and weights in `found`; a loop of its own: sums over pixels need other threads."""
+    slope, weight = found.chunk(2, 1)
+    return sums_of(rows, slope, weight, x, y, products, list(gradient[tiles].unbind(1)), rules)
+
+
+# -- lists in blocks -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -29,18 +100,18 @@ class Segments:
 
     entries: Int[Tensor, "S K"]
     """Row of the screen splat; M, one past the last, is padding."""
-    tiles: Int[Tensor, "S"]
+    tiles: Blocks
     """Tile of each block; the last one for blocks that have none."""
-    number: Int[Tensor, "S"]
-    """Of each block within its tile, from 0; -1 where it has none."""
-    left: Int[Tensor, "S"]
+    number: Blocks
+    """Number of each block within its tile, from 0; -1 where it has none."""
+    left: Blocks
     """Blocks of its tile behind each."""
     edges: Int[Tensor, "T_1"]
     """First block of each tile, then one past the last."""
     places: Int[Tensor, "P"]
     """Entry of each pair, pairs sorted by splat."""
     doublings: int
-    """How often 1 has to be doubled to reach the number of blocks of any tile."""
+    """Doublings from 1 to at least the number of blocks of any tile."""
 
 
 def cut(intersections: TileIntersections, splats: int, chunk: int) -> Segments:
@@ -50,7 +121,8 @@ def cut(intersections: TileIntersections, splats: int, chunk: int) -> Segments:
     total, most = torch.stack([edges[-1], counts.amax()]).tolist()
     size = max(LEAST_BLOCKS, total)
     place = entry_places(edges, intersections.starts, intersections.tiles, chunk)
-    number, left, tiles = within_tiles(blocks_tiles(edges, size), edges)
+    block_tiles = torch.searchsorted(edges[1:], torch.arange(size, device=edges.device), right=True)
+    number, left, tiles = within_tiles(block_tiles, edges)
     listed = intersections.splats
     return Segments(
         entries=listed.new_full((size * chunk,), splats).scatter_(0, place, listed).view(size, chunk),
@@ -63,24 +135,17 @@ def cut(intersections: TileIntersections, splats: int, chunk: int) -> Segments:
     )
 
 
-def blocks_tiles(edges: Int[Tensor, "T_1"], size: int) -> Int[Tensor, "S"]:
-    """Tile of each of `size` blocks; one past the last behind all."""
-    return torch.searchsorted(edges[1:], torch.arange(size, device=edges.device), right=True)
-
-
 @fused
 def entry_places(
     edges: Int[Tensor, "T_1"], starts: Int[Tensor, "T_1"], tiles: Int[Tensor, "P"], chunk: int
 ) -> Int[Tensor, "P"]:
-    """Entry of each pair."""
+    """Returns the entry of each pair."""
     return torch.arange(tiles.shape[0], device=tiles.device) + (edges * chunk - starts)[tiles]
 
 
 @fused
-def within_tiles(
-    tile: Int[Tensor, "S"], edges: Int[Tensor, "T_1"]
-) -> tuple[Int[Tensor, "S"], Int[Tensor, "S"], Int[Tensor, "S"]]:
-    """(number of each block within its tile, how many follow there, the tile); -1, 0 and the last tile behind all."""
+def within_tiles(tile: Blocks, edges: Int[Tensor, "T_1"]) -> tuple[Blocks, Blocks, Blocks]:
+    """Returns (number of each block in its tile, how many follow there, the tile); -1, 0 and the last tile past all."""
     last = edges.shape[0] - 2
     near, block = tile.clamp_max(last), torch.arange(tile.shape[0], device=tile.device)
     there = tile <= last
@@ -88,25 +153,32 @@ def within_tiles(
     return torch.where(there, number, -1), torch.where(there, left, 0), near
 
 
+def parts(total: int, size: int) -> list[slice]:
+    """Returns slices of about `size` that cover `total`; none has a single element unless there is only one."""
+    edges = [*range(0, max(total - 1, 1), size), total]
+    return [slice(a, b) for a, b in pairwise(edges)]
+
+
+# -- scans ---------------------------------------------------------------------------------------------------------
+
+
 @fused
-def with_earlier(product: Float[Tensor, "S P"], number: Int[Tensor, "S"], step: Int[Tensor, ""]) -> Tensor:
-    """Products over twice as many blocks."""
+def with_earlier(product: Light, number: Blocks, step: Int[Tensor, ""]) -> Light:
+    """Returns products over twice as many blocks."""
     earlier = (torch.arange(number.shape[0], device=number.device) - step).clamp_min(0)
     return torch.where((number >= step)[:, None], product * product[earlier], product)
 
 
 @fused
-def one_earlier(product: Float[Tensor, "S P"], number: Int[Tensor, "S"]) -> Tensor:
-    """What stands one block before, 1 before the first of a tile."""
+def one_earlier(product: Light, number: Blocks) -> Light:
+    """Shifts values one block back; 1 before the first block of a tile."""
     earlier = (torch.arange(number.shape[0], device=number.device) - 1).clamp_min(0)
     return torch.where((number >= 1)[:, None], product[earlier], 1.0)
 
 
 @fused
-def with_later(
-    own: Float[Tensor, "S P"], passed: Float[Tensor, "S P"], left: Int[Tensor, "S"], step: Int[Tensor, ""]
-) -> tuple[Tensor, Tensor]:
-    """(pictures of twice as many blocks, the share of light that passes them)."""
+def with_later(own: Light, passed: Light, left: Blocks, step: Int[Tensor, ""]) -> tuple[Light, Light]:
+    """Returns (pictures of twice as many blocks, the share of light that passes them)."""
     size = left.shape[0]
     later = (torch.arange(size, device=left.device) + step).clamp_max(size - 1)
     there = (left >= step)[:, None]
@@ -114,28 +186,28 @@ def with_later(
 
 
 @fused
-def one_later(own: Float[Tensor, "S P"], left: Int[Tensor, "S"]) -> Tensor:
-    """What stands one block behind, 0 behind the last of a tile."""
+def one_later(own: Light, left: Blocks) -> Light:
+    """Shifts values one block forward; 0 behind the last block of a tile."""
     size = left.shape[0]
     later = (torch.arange(size, device=left.device) + 1).clamp_max(size - 1)
     return torch.where((left >= 1)[:, None], own[later], 0.0)
 
 
 def steps_of(segments: Segments) -> list[Int[Tensor, ""]]:
-    """1, 2, 4, ..., as many as the scan doubles."""
+    """Returns the steps of a scan: 1, 2, 4, ..."""
     return list((2 ** torch.arange(segments.doublings, device=segments.number.device)).unbind())
 
 
-def before_blocks(passed: Float[Tensor, "S P"], segments: Segments) -> Float[Tensor, "S P"]:
-    """Transmittance in front of every block: the product of what the blocks before it let pass."""
+def before_blocks(passed: Light, segments: Segments) -> Light:
+    """Returns the transmittance in front of every block: the product of those of earlier blocks."""
     product = passed
     for step in steps_of(segments):
         product = with_earlier(product, segments.number, step)
     return one_earlier(product, segments.number)
 
 
-def behind_blocks(passed: Float[Tensor, "S P"], own: Float[Tensor, "S P"], segments: Segments) -> Float[Tensor, "S P"]:
-    """The picture behind every block as seen from there; `own` is each block's by itself.
+def behind_blocks(passed: Light, own: Light, segments: Segments) -> Light:
+    """Returns the gradient-weighted picture behind every block; `own` is that of each block alone.
 
     (own a, passed a) before (own b, passed b) is (own a + passed a own b, passed a passed b): associative.
     """
@@ -144,10 +216,7 @@ def behind_blocks(passed: Float[Tensor, "S P"], own: Float[Tensor, "S P"], segme
     return one_later(own, segments.left)
 
 
-def parts(total: int, size: int) -> list[slice]:
-    """Slices of about `size` that cover `total`; none has a single element unless there is only one."""
-    edges = [*range(0, max(total - 1, 1), size), total]
-    return [slice(a, b) for a, b in pairwise(edges)]
+# -- blending ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -160,7 +229,6 @@ class SegmentJob:
     y: Float[Tensor, "P"]
     products: Float[Tensor, "3 P"]
     """x^2, x y, y^2."""
-    loops: SegmentKernels
     rules: Rules
     precision: Precision
     batch: int
@@ -170,7 +238,7 @@ class SegmentJob:
 def segment_job(
     segments: Segments, grid: TileGrid, rules: Rules, precision: Precision, values: int, device: torch.device
 ) -> SegmentJob:
-    """What the schedule needs beside its lists; `values`: alphas at once."""
+    """Collects what the schedule needs; `values`: alphas at once."""
     basis = basis_of(grid.tile, precision.exact, device)
     return SegmentJob(
         segments=segments,
@@ -178,7 +246,6 @@ def segment_job(
         x=basis.x[:, 0],
         y=basis.y[:, 0],
         products=basis.products[..., 0],
-        loops=segment_kernels(rules),
         rules=rules,
         precision=precision,
         batch=max(LEAST_BLOCKS, values // (rules.chunk * grid.tile**2)),
@@ -187,46 +254,47 @@ def segment_job(
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """What the way back needs of the way forward."""
+    """Values that the backward pass needs from the forward pass."""
 
-    rows: Float[Tensor, "S K F"]
-    passed: Float[Tensor, "S P"]
-    before: Float[Tensor, "S P"]
-    lights: list[Float[Tensor, "S P"]]
+    rows: Rows
+    passed: Light
+    before: Light
+    lights: list[Light]
 
 
 def blend_segments(job: SegmentJob, table: Float[Tensor, "M_1 F"]) -> tuple[Float[Tensor, "T P C_1"], Kept]:
-    """Channels and coverage of every tile."""
-    segments, loops, dtype = job.segments, job.loops, job.precision.accumulation
+    """Returns (channels and coverage of every tile, what the backward pass needs)."""
+    segments, rules = job.segments, job.rules
     centres = job.grid.centres(segments.tiles, table)[:, :, None]
-    rows = loops.make_rows(table, segments.entries, centres)
-    passed = loops.fade(rows, job.x, job.y).to(dtype)
+    rows = compiled_loop(make_rows, rules)(table, segments.entries, centres)
+    passed = compiled_loop(fade, rules)(rows, job.x, job.y).to(job.precision.accumulation)
     before = before_blocks(passed, segments)
-    lights = loops.light(rows, before, job.x, job.y)
-    return torch.stack([sum_by_tile(light, segments) for light in lights], 2), Kept(rows, passed, before, lights)
+    lights = compiled_loop(light, rules)(rows, before, job.x, job.y)
+    return torch.stack([sum_by_tile(one, segments) for one in lights], 2), Kept(rows, passed, before, lights)
 
 
-def sum_by_tile(values: Float[Tensor, "S P"], segments: Segments) -> Float[Tensor, "T P"]:
+def sum_by_tile(values: Light, segments: Segments) -> Float[Tensor, "T P"]:
     """Sums over the blocks of each tile."""
     blocks = torch.arange(len(values), device=values.device)
     return bag_sums(values, blocks, segments.edges)
 
 
 def segment_moments(job: SegmentJob, kept: Kept, gradient: Float[Tensor, "T C_1 P"]) -> Float[Tensor, "S K V"]:
-    """Moments of every entry, `batch` blocks at a time."""
-    segments, loops = job.segments, job.loops
-    own = loops.own_picture(kept.lights, kept.before, segments.tiles, gradient)
+    """Returns the moments of every entry, `batch` blocks at a time."""
+    segments, rules = job.segments, job.rules
+    own = compiled_loop(block_picture, rules)(kept.lights, kept.before, segments.tiles, gradient)
     behind = behind_blocks(kept.passed, own, segments)
+    slopes_loop, sums_loop = compiled_loop(entry_slopes, rules), compiled_loop(entry_sums, rules)
     found = []
     for part in parts(len(own), job.batch):
         rows, tiles = kept.rows[part], segments.tiles[part]
-        slopes = loops.entry_slopes(rows, kept.before[part], behind[part], tiles, gradient, job.x, job.y)
-        found.append(loops.entry_sums(rows, slopes, tiles, gradient, job.x, job.y, job.products))
+        slope = slopes_loop(rows, kept.before[part], behind[part], tiles, gradient, job.x, job.y)
+        found.append(sums_loop(rows, slope, tiles, gradient, job.x, job.y, job.products))
     return torch.cat(found) if len(found) > 1 else found[0]
 
 
 class SegmentComposite(torch.autograd.Function):
-    """`table`: everything blending needs of each splat, and last a row that draws nothing."""
+    """Blends the splats of a table (`compiled.padded_table`) by segments."""
 
     @staticmethod
     def forward(ctx, table, absgrad, intersections, job):
@@ -238,9 +306,9 @@ class SegmentComposite(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient):
         job, intersections, count, kept, absolute = ctx.kept
-        seen = job.grid.to_tiles(gradient.to(job.precision.accumulation))
-        moments = segment_moments(job, kept, seen)
-        values = job.loops.entry_gradients(kept.rows, moments).flatten(0, 1)
+        by_tile = job.grid.to_tiles(gradient.to(job.precision.accumulation))
+        moments = segment_moments(job, kept, by_tile)
+        values = compiled_loop(entry_gradients, job.rules)(kept.rows, moments).flatten(0, 1)
         total = sum_by_splat(values, intersections, job.segments.places, count).to(gradient.dtype)
         width = TABLE + job.rules.channels
         return total[:, :width], total[:-1, width:] if absolute else None, None, None

@@ -1,9 +1,9 @@
-"""Threads that wait for each other, on cores that other programs want, too.
+"""Idle threads that keep training fast on cores shared with other programs.
 
-Each of a step's hundreds of short loops ends when all of its threads have. GNU OpenMP lets those that are ready spin
-for longer than a scheduler's slice, which is fastest alone. Where another program has taken a core, they keep from it
-the very thread that they wait for. OpenMP lets them sleep early only while it counts more threads of its own in a
-process than there are cores. So a process whose threads wait for cores gets as many more, which do nothing.
+Each of a step's hundreds of short loops ends when all of its threads have. GNU OpenMP lets finished threads spin for
+longer than a scheduler's slice. That is fastest on free cores; on busy ones they block the very thread that they wait
+for. OpenMP lets threads sleep early only while it counts more of its own in a process than there are cores. So a
+process whose threads wait for cores gets extra threads, which do nothing.
 """
 
 import logging
@@ -21,20 +21,20 @@ from gsx.core.rasterizer.sorting import GRAIN
 logger = logging.getLogger(__name__)
 
 TASKS = Path("/proc/self/task")
-"""Linux says there of each thread for how long it has run, and waited for a core (schedstat), ns."""
+"""Folder of Linux with the times that each thread has run, and waited for a core (schedstat), ns."""
 EVERY = 0.25
-"""Seconds between looks."""
+"""Seconds between measurements."""
 NAME = "gsx cores"
-"""Of the thread that looks."""
+"""Name of the measuring thread."""
 MANY, FEW = 0.25, 0.05
-"""Threads that wait for a core, on average, where others want it, and where nobody does. By hand on two cores, beside
-another program: 1, and 0.4 with idle threads; alone: below 0.01."""
+"""Mean number of threads waiting for a core, above which idle threads start and up to which they end. Measured on two
+cores with another program: 1, and 0.4 with idle threads; without one: below 0.01."""
 
 
 def watch_cores() -> None:
     """Starts a thread, once per process, that adds idle threads while this process's threads wait for cores.
 
-    No result depends on it. Nothing happens where there is one thread, or where the system does not say who waits.
+    No result depends on it. Does nothing for a single thread, or on a system that does not report waiting times.
     """
     watched = any(thread.name == NAME for thread in threading.enumerate())
     if not watched and torch.get_num_threads() > 1 and waits():
@@ -54,7 +54,7 @@ def watch() -> None:
         if idle is None and waiting > MANY:
             idle = start_idle_threads()
             if not logged:
-                logger.info("CPU is busy with other programs: this takes longer")
+                logger.info("CPU is busy with other programs: training will be slower")
                 logged = True
         elif idle is not None and waiting <= FEW:
             idle.set()
@@ -62,7 +62,7 @@ def watch() -> None:
 
 
 def waits() -> dict[str, int]:
-    """Returns for how long each thread of this process has waited for a core, ns; empty where the system hides it."""
+    """Returns the time that each thread of this process has waited for a core, ns; empty if the system hides it."""
     times = dict[str, int]()
     for file in TASKS.glob("*/schedstat"):
         with suppress(OSError, IndexError, ValueError):  # a thread may end meanwhile
@@ -71,21 +71,21 @@ def waits() -> dict[str, int]:
 
 
 def waited_between(before: Mapping[str, int], after: Mapping[str, int]) -> float:
-    """Returns for how long threads, taken together, have waited for a core in between, seconds."""
+    """Returns the time that all threads together have waited for a core in between, seconds."""
     return sum(after[thread] - before[thread] for thread in before.keys() & after.keys()) / 1e9
 
 
 def teams_needed() -> int:
-    """Returns how many teams of torch's size, beside its own, make OpenMP count more threads than cores.
+    """Returns how many extra teams of torch's size make OpenMP count more threads than cores.
 
-    It counts those that it has begun: all but the first of a team, and one more.
+    It counts the threads that it has started: all but the first of a team, and one more.
     """
-    cores, begun = len(os.sched_getaffinity(0)), max(1, torch.get_num_threads() - 1)
-    return max(1, -(-(cores - begun) // begun))
+    cores, started = len(os.sched_getaffinity(0)), max(1, torch.get_num_threads() - 1)
+    return max(1, -(-(cores - started) // started))
 
 
 def start_idle_threads() -> threading.Event:
-    """Starts so many threads that OpenMP counts more than there are cores; they sleep until the event is set."""
+    """Starts enough threads for OpenMP to count more than there are cores; they sleep until the event is set."""
     ended = threading.Event()
 
     def lead() -> None:
