@@ -14,17 +14,17 @@ from gsx.core.errors import InputError
 from gsx.engine.cache import (
     IN_USE,
     MANIFEST,
+    add_to_manifest,
     cache_folder,
     cache_root,
     content_key,
-    enlist,
+    creation_lock,
     entries,
     file_stamp,
     in_use,
-    made_by_one,
+    is_intact,
     make_folder,
     trim,
-    whole,
 )
 
 
@@ -115,7 +115,7 @@ def entry(name: str, used: float, size: int = 100) -> Path:
     """An entry with one file, used so many seconds after 1970."""
     file = make_folder(cache_folder(name[0], name)) / "state"
     file.write_bytes(bytes(size))
-    enlist(file)
+    add_to_manifest(file)
     os.utime(file.parent / MANIFEST, (used, used))
     return file.parent
 
@@ -151,7 +151,7 @@ def test_what_a_process_at_work_has_used_stays(cache: Path) -> None:
     ) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "in\n"
-        assert whole(since / "state")  # used now, by whomever
+        assert is_intact(since / "state")  # used now, by whomever
         assert trim(0) == [before]
         other.kill()
     assert len(list((cache / IN_USE).iterdir())) == 1, "a killed process leaves its file"
@@ -170,7 +170,7 @@ def test_what_is_used_while_others_are_removed_stays(cache: Path, monkeypatch: p
 
     monkeypatch.setattr("gsx.engine.cache.entries", overtaken)
     assert trim(0) == []
-    assert whole(made / "state")
+    assert is_intact(made / "state")
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="permissions do not hold root")
@@ -193,16 +193,16 @@ def test_its_own_use_ends_with_the_context(cache: Path) -> None:
 @pytest.mark.usefixtures("cache")
 def test_a_file_is_whole_as_it_was_written_last(caplog: pytest.LogCaptureFixture) -> None:
     file = entry("a1", 0) / "state"
-    assert whole(file)
+    assert is_intact(file)
     assert (file.parent / MANIFEST).stat().st_mtime > 1e9
     file.write_bytes(bytes(99) + b"1")
-    assert not whole(file)
+    assert not is_intact(file)
     assert "is damaged, computing it again" in caplog.text
-    enlist(file)
-    assert whole(file)
+    add_to_manifest(file)
+    assert is_intact(file)
     (file.parent / MANIFEST).write_text('{"file": "state"')  # a line that was cut
-    assert not whole(file)
-    assert not whole(file.with_name("absent"))
+    assert not is_intact(file)
+    assert not is_intact(file.with_name("absent"))
 
 
 def test_where_nothing_can_be_written_the_cache_is_used_all_the_same(
@@ -231,12 +231,12 @@ def test_waiting_for_another_process_is_told(tmp_path: Path, caplog: pytest.LogC
     file, got = tmp_path / "blend-0123.bin", list[bool]()
 
     def wait() -> None:
-        with made_by_one(file, wait=True) as alone:
+        with creation_lock(file, wait=True) as alone:
             got.append(alone)
 
     caplog.set_level("INFO", "gsx")
     thread = Thread(target=wait)
-    with made_by_one(file) as alone:
+    with creation_lock(file) as alone:
         thread.start()
         deadline = time.monotonic() + 60
         while not caplog.messages and time.monotonic() < deadline:

@@ -22,7 +22,7 @@ from torch import Tensor
 from gsx.core.errors import CompilerError
 from gsx.core.quality.similarity import correlate
 from gsx.engine.backend import COMPILED, compiled_kernel
-from gsx.engine.cache import made_by_one
+from gsx.engine.cache import creation_lock
 from gsx.engine.compile_cache import (
     FOLDER,
     CachedFunction,
@@ -275,7 +275,7 @@ def test_calls_are_known_before_they_are_compiled(folder: Path, monkeypatch: pyt
         function(x, y).sum().backward()
     assert (len(calls), names) == (1, [])
     (file,) = [kept.file(arguments) for kept, arguments, _ in calls]
-    with made_by_one(file):  # another process compiles it
+    with creation_lock(file):  # another process compiles it
         make_ahead(calls)
     make_ahead(calls, stopping=lambda: True)
     assert uncached(calls) == calls

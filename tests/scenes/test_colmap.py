@@ -22,7 +22,7 @@ from gsx.core.data.images import read_image, write_image
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
-from gsx.engine.cache import enlist
+from gsx.engine.cache import add_to_manifest
 from gsx.scenes import splits
 from gsx.scenes.colmap import load
 from gsx.scenes.colmap_folders import count_images
@@ -630,7 +630,7 @@ def test_undistorted_photos_are_kept_and_found_again(tmp_path: Path, cache: Path
     write_image(stored, torch.zeros_like(fresh))
     assert torch.equal(first_view().image(), fresh)  # what is not as it was written is made again
     write_image(stored, torch.zeros_like(fresh))
-    enlist(stored)
+    add_to_manifest(stored)
     assert not first_view().image().any()  # taken from the cache
     photo = tmp_path / "images" / first_view().name
     os.utime(photo, ns=(0, 0))

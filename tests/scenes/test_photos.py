@@ -22,7 +22,7 @@ from torch import Tensor
 from gsx.core.data.images import image_size, read_image, write_image
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError, InputError
-from gsx.engine.cache import enlist
+from gsx.engine.cache import add_to_manifest
 from gsx.experiments.runs.typed import typed
 from gsx.scenes import photos, sfm
 from gsx.scenes.orientation import AFTER_MIRROR, oriented, oriented_camera
@@ -346,7 +346,7 @@ def test_another_process_that_finishes_first_wins(tmp_path: Path, cache: Path, m
         final = work.parent / work.name.split(".")[1]
         final.mkdir()
         (final / "cameras.bin").write_bytes(b"theirs")
-        enlist(final / "cameras.bin")
+        add_to_manifest(final / "cameras.bin")
         return StubModel()
 
     monkeypatch.setattr(sfm, "reconstruct", overtaken)

@@ -40,9 +40,7 @@ def cache_root() -> Path:
     name = os.environ.get("GSX_CACHE") or f"{os.environ.get('XDG_CACHE_HOME') or '~/.cache'}/gsx"
     root = expand_home(name)
     if str(root).startswith("~"):
-        raise InputError(
-            f"the cache folder {name} has no home folder: set GSX_CACHE to a writable folder"
-        )
+        raise InputError(f"the cache folder {name} has no home folder: set GSX_CACHE to a writable folder")
     return root
 
 
@@ -102,7 +100,7 @@ def make_folder(folder: Path) -> Path:
 # -- manifests ---------------------------------------------------------------------------------------------------------
 
 
-def enlist(*files: Path) -> None:
+def add_to_manifest(*files: Path) -> None:
     """Adds size and digest of files to the manifest of their entry, the folder that holds them.
 
     Raises:
@@ -118,7 +116,7 @@ def fingerprint(content: bytes) -> dict[str, Any]:
     return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
-def listed(entry: Path, name: str = "") -> dict[str, dict[str, Any]]:
+def read_manifest(entry: Path, name: str = "") -> dict[str, dict[str, Any]]:
     """Reads fingerprints from the manifest of an entry, at least that of the named file; skips damaged lines."""
     notes, quoted = {}, json.dumps(name).strip('"')
     with suppress(OSError):
@@ -130,7 +128,7 @@ def listed(entry: Path, name: str = "") -> dict[str, dict[str, Any]]:
     return notes
 
 
-def whole(file: Path) -> bool:
+def is_intact(file: Path) -> bool:
     """Checks that a file of an entry is as written, and marks the entry as used now; warns of a damaged file."""
     try:
         content = file.read_bytes()
@@ -139,7 +137,7 @@ def whole(file: Path) -> bool:
     except OSError as error:
         logger.warning("%s cannot be read (%s), computing it again", file, error.strerror)
         return False
-    if listed(file.parent, file.name).get(file.name) != fingerprint(content):
+    if read_manifest(file.parent, file.name).get(file.name) != fingerprint(content):
         logger.warning("%s is damaged, computing it again", file)
         return False
     with suppress(OSError):
@@ -151,7 +149,7 @@ def whole(file: Path) -> bool:
 
 
 @contextmanager
-def made_by_one(file: Path, wait: bool = False) -> Iterator[bool]:
+def creation_lock(file: Path, wait: bool = False) -> Iterator[bool]:
     """Locks the making of a file; yields True in the process that has the lock, and in all where locking fails.
 
     `wait`: until the other process has finished. The lock of a killed process is free.

@@ -29,7 +29,7 @@ from torch import Tensor
 import gsx
 from gsx.core.errors import first_line
 from gsx.core.files import replacing
-from gsx.engine.cache import content_key, file_stamp, made_by_one, source_digest, source_files
+from gsx.engine.cache import content_key, creation_lock, file_stamp, source_digest, source_files
 from gsx.engine.machine import processor_kind
 
 logger = logging.getLogger(__name__)
@@ -229,7 +229,7 @@ class CachedFunction:
         if file is None:
             return None
         try:
-            with waiting(), made_by_one(file, wait=True):
+            with waiting(), creation_lock(file, wait=True):
                 known, slot = self.find(file, arguments)
                 if known is None:
                     logger.info("compiling %s, once for all later runs ...", self.function.__name__)
@@ -393,6 +393,7 @@ def make_ahead(calls: Sequence[Call], stopping: Callable[[], bool] = lambda: Fal
         file = file_of(function, arguments, gradients)
         if file is None or file.exists():
             continue
-        with made_by_one(file) as alone, torch.set_grad_enabled(gradients), suppress(Exception):  # its user reports it
+        # a failure is reported where the function is called
+        with creation_lock(file) as alone, torch.set_grad_enabled(gradients), suppress(Exception):
             if alone and not file.exists():
                 function.make(file, arguments)

@@ -26,7 +26,7 @@ from gsx.core.files import replace_file
 from gsx.core.ranges import Interval, Range, Rate, Seconds
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import RegeneratorContext, Request
-from gsx.engine.cache import cache_folder, content_key, enlist, whole
+from gsx.engine.cache import add_to_manifest, cache_folder, content_key, is_intact
 from gsx.engine.machine import machine_stamp, multiplies_bfloat16
 
 logger = logging.getLogger(__name__)
@@ -113,7 +113,7 @@ class SceneSR:
         generator = torch.Generator().manual_seed(context.seed)
         self.network = Enlarger(self.options.channels, self.options.layers, generator).to(context.device)
         path = kept_at(self.options, photos, context.reduction, context.seed, context.device)
-        if whole(path) and (found := read_network(path)) is not None:
+        if is_intact(path) and (found := read_network(path)) is not None:
             self.network.load_state_dict(found)
             return {"learnt_before": 1.0}
         begun = time.perf_counter()
@@ -227,7 +227,7 @@ def write_network(path: Path, network: nn.Module) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, save({name: value.contiguous() for name, value in network.state_dict().items()}))
-        enlist(path)
+        add_to_manifest(path)
     except OSError as error:
         logger.warning("%s cannot be written (%s): the next run learns again", path, error.strerror)
 

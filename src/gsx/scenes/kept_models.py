@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsx.core.files import process_tag
-from gsx.engine.cache import enlist, listed, make_folder, whole
+from gsx.engine.cache import add_to_manifest, is_intact, make_folder, read_manifest
 
 
 def kept_model(final: Path, make: Callable[[Path], Any]) -> Path:
@@ -23,15 +23,15 @@ def kept_model(final: Path, make: Callable[[Path], Any]) -> Path:
         made = make(Path(work))
         model = make_folder(Path(work) / "model")
         made.write_binary(model)
-        enlist(*model.iterdir())
+        add_to_manifest(*model.iterdir())
         _publish(model, final)
     return final
 
 
 def intact(final: Path) -> bool:
     """Return whether there is a model in the cache, and all its files are as they were written."""
-    names = listed(final)
-    return bool(names) and all(whole(final / name) for name in names)
+    names = read_manifest(final)
+    return bool(names) and all(is_intact(final / name) for name in names)
 
 
 def _publish(model: Path, final: Path) -> None:

@@ -20,7 +20,7 @@ from gsx.core.data.resize import to_uint8
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float, UInt8
 from gsx.engine.cache import cache_folder, content_key, file_stamp, make_folder
-from gsx.engine.kept_images import keep_image, kept_image
+from gsx.engine.cached_images import cache_image, read_cached_image
 from gsx.scenes.lens_folds import Cut, cut_where_folded, project, shows_truly
 
 ROWS_PER_BAND = 256  # rows sampled at a time: bounds the memory of the grid, whatever the photo's height
@@ -209,12 +209,12 @@ class StoredUndistortion:
 
     def __call__(self, image: UInt8[Tensor, "C H W"]) -> UInt8[Tensor, "C h w"]:
         stored = self.stored()
-        kept = kept_image(stored)
+        kept = read_cached_image(stored)
         if kept is not None:
             return kept
         make_folder(stored.parent)  # without it every photo would be undistorted many times
         result = undistort(image, self.intrinsics, self.pinhole, self.size)
-        keep_image(stored, result)
+        cache_image(stored, result)
         return result
 
     def stored(self) -> Path:

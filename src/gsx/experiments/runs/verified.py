@@ -11,7 +11,7 @@ from gsx.core.data.images import read_image
 from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError
 from gsx.core.files import write_json
-from gsx.engine.cache import cache_folder, content_key, enlist, file_stamp, whole
+from gsx.engine.cache import add_to_manifest, cache_folder, content_key, file_stamp, is_intact
 from gsx.scenes.photo_source import PhotoSource
 
 logger = logging.getLogger(__name__)
@@ -32,7 +32,7 @@ def verified(scene: Scene) -> Scene:
     photos = [source for source in sources if isinstance(source, PhotoSource)]
     masks = [source.mask.path for source in photos if source.mask is not None]
     paths = list(dict.fromkeys([*(source.path for source in photos), *masks]))
-    if not paths or whole(known := remembered(paths)):
+    if not paths or is_intact(known := remembered(paths)):
         return scene
     if len(paths) >= LONG:
         logger.info("checking all %d photos once", len(paths))
@@ -40,7 +40,7 @@ def verified(scene: Scene) -> Scene:
     with suppress(OSError):  # without a cache they are checked again next time
         known.parent.mkdir(parents=True, exist_ok=True)
         write_json(known, [str(path) for path in paths])
-        enlist(known)
+        add_to_manifest(known)
     return scene
 
 

@@ -13,7 +13,7 @@ from gsx.core.errors import InputError, first_line
 from gsx.core.files import read_json, write_json
 from gsx.core.packages import require
 from gsx.core.shapes import Float, UInt8
-from gsx.engine.cache import content_key, file_stamp, made_by_one
+from gsx.engine.cache import content_key, creation_lock, file_stamp
 
 logger = logging.getLogger(__name__)
 
@@ -43,7 +43,7 @@ def photos_of(path: Path, output: Path, count: int = FRAMES) -> Path:
     made_of = [*map(str, file_stamp(path)), count, *([turns] if turns else [])]
     folder = output / "videos" / f"{path.stem}_{content_key(made_of)[:8]}"
     if not chosen(folder, made_of):
-        with made_by_one(folder / INDEX, wait=True):
+        with creation_lock(folder / INDEX, wait=True):
             if not chosen(folder, made_of):
                 choose(path, folder, count, made_of)
                 return folder

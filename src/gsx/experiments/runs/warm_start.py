@@ -16,7 +16,16 @@ from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, replace_file, replace_text, write_json
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run, StepResult
-from gsx.engine.cache import cache_folder, content_key, enlist, file_stamp, make_folder, source_revision, trim, whole
+from gsx.engine.cache import (
+    add_to_manifest,
+    cache_folder,
+    content_key,
+    file_stamp,
+    is_intact,
+    make_folder,
+    source_revision,
+    trim,
+)
 from gsx.engine.machine import machine_stamp
 from gsx.experiments.run_folder import checkpoint
 from gsx.experiments.run_folder.run_key import scene_stamp, trained
@@ -73,7 +82,7 @@ def adopt(run: Run, folder: Path) -> None:
     for sidecar in reversed([path for path in checkpoint.sidecars(folder) if checkpoint.step_of(path) <= common]):
         try:
             checkpoint.read(sidecar)
-            if not whole(lines_at(sidecar)):
+            if not is_intact(lines_at(sidecar)):
                 raise CheckpointError(f"{sidecar} lacks the lines up to its step")
             branch(run, sidecar)
         except (CheckpointError, OSError) as error:
@@ -127,10 +136,10 @@ class WarmStartKeeper:
         """Write the state to the cache."""
         folder = make_folder(self.folder)
         kept = [path for path in checkpoint.sidecars(folder) if checkpoint.step_of(path) == run.step]
-        if kept and whole(lines_at(kept[0])):
+        if kept and is_intact(lines_at(kept[0])):
             return
         lines = lines_at(folder / f"step_{run.step:07d}.json")
         write_json(lines, {"lines": run.progress.curves})
-        enlist(lines)
+        add_to_manifest(lines)
         checkpoint.write(run, folder)  # its sidecar has the digest of its tensors
         trim(self.gigabytes)

@@ -11,7 +11,7 @@ import torch
 
 from gsx.core.errors import InputError, TrainingError
 from gsx.core.files import replace_file
-from gsx.engine.cache import enlist, make_folder, whole
+from gsx.engine.cache import add_to_manifest, is_intact, make_folder
 from gsx.regenerators.diffusion.options import TuningOptions
 
 logger = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ def adapter_bytes(pipe: Any) -> bytes:
 
 def adopted(shared: Path, own: Path) -> bool:
     """Whether the cache had the adapter; it is then in the run's folder too."""
-    if not whole(shared / FACTS):
+    if not is_intact(shared / FACTS):
         return False
     try:
         read_facts(shared)
@@ -71,7 +71,7 @@ def share(own: Path, shared: Path) -> None:
     """Lets later runs have the adapter; a cache that cannot be written is no error."""
     try:
         copy_adapter(own, make_folder(shared))
-        enlist(shared / FACTS)  # which have the digest of the weights
+        add_to_manifest(shared / FACTS)  # which have the digest of the weights
     except (OSError, InputError) as error:
         logger.warning("%s: later runs will learn again", error)
 

@@ -19,7 +19,7 @@ from gsx.core.packages import require
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.engine.cache import cache_folder, content_key
-from gsx.engine.kept_images import keep_image, kept_image
+from gsx.engine.cached_images import cache_image, read_cached_image
 from gsx.engine.machine import machine_stamp
 from gsx.regenerators.classical import refuse_enlarging
 from gsx.regenerators.diffusion.model_specs import Batch, ModelSpec, spec_of
@@ -145,13 +145,13 @@ class Diffusion:
         """Results of a batch, from the cache if it holds this batch: what is drawn may depend on the company."""
         contents = [content_of(part) for part in together]
         paths = [self.path(contents, number, turn) for number in range(len(together))]
-        kept = [kept_image(path) for path in paths] if self.options.cached else []
+        kept = [read_cached_image(path) for path in paths] if self.options.cached else []
         if kept and all(result is not None for result in kept):
             return [result.float() / 255 for result in kept if result is not None]
         results = [rounded(result) for result in self.called(batch_of(together))]
         for path, result in zip(paths, results, strict=True):
             if self.options.cached and bool(torch.isfinite(result).all()):
-                keep_image(path, result)
+                cache_image(path, result)
         return results
 
     def called(self, batch: Batch) -> Float[Tensor, "B 3 H W"]:

@@ -19,7 +19,7 @@ from gsx.core.errors import ConfigError
 from gsx.core.ranges import Points, Range, Seed
 from gsx.core.shapes import Float, UInt8
 from gsx.engine.cache import cache_folder, content_key
-from gsx.engine.kept_images import keep_image, kept_image
+from gsx.engine.cached_images import cache_image, read_cached_image
 from gsx.scenes.demo.passer_by import with_passer_by
 from gsx.scenes.demo.still_life import StillLife, make_still_life
 from gsx.scenes.demo.tracing import colours_of, render, seen_at
@@ -80,11 +80,11 @@ class DemoSource:
         """Rendered, or read where an earlier run has rendered it."""
         if not same_view(camera, self.own):
             return render(self.life, camera, self.samples)
-        kept = kept_image(path)
+        kept = read_cached_image(path)
         if kept is not None and kept.shape == (3, camera.height, camera.width):
             return kept
         made = render(self.life, camera, self.samples)
-        keep_image(path, made)
+        cache_image(path, made)
         return made
 
 

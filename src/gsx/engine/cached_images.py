@@ -9,14 +9,14 @@ from torch import Tensor
 from gsx.core.data.images import read_image, write_image
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float, UInt8
-from gsx.engine.cache import enlist, make_folder, whole
+from gsx.engine.cache import add_to_manifest, is_intact, make_folder
 
 logger = logging.getLogger(__name__)
 
 
-def kept_image(path: Path) -> UInt8[Tensor, "C H W"] | None:
-    """Reads an image as `keep_image` left it; None if it is missing or damaged."""
-    if not whole(path):
+def read_cached_image(path: Path) -> UInt8[Tensor, "C H W"] | None:
+    """Reads an image as `cache_image` left it; None if it is missing or damaged."""
+    if not is_intact(path):
         return None
     try:
         return read_image(path)
@@ -25,12 +25,12 @@ def kept_image(path: Path) -> UInt8[Tensor, "C H W"] | None:
         return None
 
 
-def keep_image(path: Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, "C H W"]) -> None:
+def cache_image(path: Path, image: UInt8[Tensor, "C H W"] | Float[Tensor, "C H W"]) -> None:
     """Writes an image to the cache as PNG; warns if that fails."""
     try:
         make_folder(path.parent)
         write_image(path, image)
-        enlist(path)
+        add_to_manifest(path)
     except (OSError, InputError) as error:
         warn_once(str(error).rstrip("."))
 
