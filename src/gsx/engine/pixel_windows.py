@@ -1,8 +1,8 @@
-"""Gaussian Blending: what light is left in a pixel is a uniform rectangle, its window (Koo, Jeong, Kim, AAAI 2026).
+"""Gaussian Blending: the light left in a pixel is a uniform rectangle, its window (Koo, Jeong, Kim, AAAI 2026).
 
 Point samples blend as if every splat covered the whole pixel; two that cover different halves hide each other by half.
 Here each splat takes its integral over the window, and the window becomes the rectangle of the same light, mean and
-variances along the axes as what the splat has left. The integral is the pixel's filter: there is no dilation.
+variances along the axes as the light behind the splat. The integral is the pixel's filter: there is no dilation.
 
 State of a pixel: `light` left (1 at first), `x`, `y` the window's middle and `wide`, `high` its sides, px. Tiles walk
 their lists splat by splat, because each window comes from the one before. Formulas: docs/explanation/numerics.md.
@@ -25,7 +25,7 @@ from gsx.core.rasterizer.settings import Precision, RasterSettings
 from gsx.core.shapes import Float, Int
 
 NARROW = 0.1
-"""A window narrower than this many standard deviations sees one alpha, that of its middle (published)."""
+"""Standard deviations; a narrower window has one alpha, that of its middle (published)."""
 LEAST_WINDOW_VARIANCE = 1e-3
 """Floor of a window's variance along each axis, px^2 (published)."""
 LEAST_SIGMA = 1e-6
@@ -44,7 +44,7 @@ class Axis:
     """One axis of a splat, and a window's extent along it: exp(-x^2 / 2 sigma^2) over [low, high]."""
 
     offset: Float[Tensor, "B P"]
-    """Of the window's middle from the splat's mean."""
+    """From the splat's mean to the window's middle, px."""
     side: Float[Tensor, "B P"]
     sigma: Float[Tensor, "B 1"]
 
@@ -69,7 +69,7 @@ class Axis:
 
 
 def axes(covariances: Float[Tensor, "M 3"], conic_factors: Float[Tensor, "M 3"]) -> Float[Tensor, "M 4"]:
-    """(n1x, n1y, sigma1, sigma2): direction of the longer axis, standard deviations along both, px.
+    """Returns (n1x, n1y, sigma1, sigma2): direction of the longer axis, standard deviations along both, px.
 
     The smaller eigenvalue is the determinant over the larger one: the difference cancels for needles.
     """
@@ -83,7 +83,7 @@ def axes(covariances: Float[Tensor, "M 3"], conic_factors: Float[Tensor, "M 3"])
 
 
 def along_axes(window: PixelWindow, row: Row) -> tuple[Axis, Axis, Tensor]:
-    """The window turned onto the axes of the splat, by at most 45 degrees; and whether its sides keep their order."""
+    """Returns the window along both axes of the splat, turned by at most 45 degrees, and where its sides keep order."""
     _, x, y, wide, high = window
     mean_x, mean_y, cos, sin, sigma1, sigma2, _ = row
     dx, dy = x - mean_x, y - mean_y
@@ -93,13 +93,12 @@ def along_axes(window: PixelWindow, row: Row) -> tuple[Axis, Axis, Tensor]:
 
 
 def is_narrow(u: Axis, v: Axis) -> Tensor:
-    """Where one alpha says it all."""
+    """Returns where the window is so narrow that the alpha of its middle holds."""
     return (u.side < NARROW * u.sigma) | (v.side < NARROW * v.sigma)
 
 
 def alpha_of(u: Axis, v: Axis, integral: Tensor, opacity: Tensor) -> tuple[Tensor, Tensor]:
-    """(mean alpha of the splat over the window, whether it is that of the middle), neither clamped nor cut; `integral`:
-    of its Gaussian."""
+    """Returns (mean alpha over the window, where it is that of the middle), not clamped. integral: of the Gaussian."""
     narrow = is_narrow(u, v)
     middle = torch.exp(-0.5 * ((u.offset / u.sigma) ** 2 + (v.offset / v.sigma) ** 2))
     area = integral / (u.side * v.side)
@@ -109,8 +108,11 @@ def alpha_of(u: Axis, v: Axis, integral: Tensor, opacity: Tensor) -> tuple[Tenso
 def remainder(
     axis: Axis, moments: tuple[Tensor, Tensor, Tensor], across: Tensor, taken: Tensor, left: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """(middle, side) along an axis of the light that a splat leaves; `moments`: the axis' own, `across`: the integral
-    along the other; `taken`: the splat's opacity over the window's area."""
+    """Returns (middle, side) along an axis of the light behind a splat.
+
+    `moments`: along the axis; `across`: the integral along the other; `taken`: the splat's opacity over the window's
+    area.
+    """
     _, first, second = moments
     mean = (axis.offset - taken * first * across) / left
     square = (axis.offset**2 + axis.side**2 / 12 - taken * second * across) / left
@@ -128,14 +130,14 @@ def behind_splat(
     alpha_max: float,
     stop: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """(alpha of one splat in front of each pixel's window, the window behind it: light, x, y, wide, high)."""
+    """Returns (alpha of one splat in front of each pixel's window, the window behind it: light, x, y, wide, high)."""
     window, columns = (light, x, y, wide, high), tuple(row.unsqueeze(2).unbind(1))
     u, v, kept = along_axes(window, columns)
     mean_x, mean_y, cos, sin, _, _, opacity = columns
     of_u, of_v = u.moments, v.moments
     exact, narrow = alpha_of(u, v, of_u[0] * of_v[0], opacity)
     alpha = torch.where((exact >= alpha_min) & (light >= stop), exact.clamp(max=alpha_max), 0.0)
-    taken = opacity * (alpha / exact.clamp_min(1e-30)) / (u.side * v.side)  # of a splat that is clamped: what it takes
+    taken = opacity * (alpha / exact.clamp_min(1e-30)) / (u.side * v.side)  # less where alpha is clamped
     mean_u, side_u = remainder(u, of_u, of_v[0], taken, 1 - alpha)
     mean_v, side_v = remainder(v, of_v, of_u[0], taken, 1 - alpha)
     moved = (alpha > 0) & ~narrow
@@ -153,14 +155,14 @@ def behind_splat(
 # -- the walk over all tiles ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Lists:
-    """What the walk reads."""
+    """Splats and their lists."""
 
     rows: Float[Tensor, "M 7"]
     """x, y on the frame, n1x, n1y, sigma1, sigma2, opacity."""
     channels: Float[Tensor, "M C"]
-    """With one of ones, for coverage."""
+    """Last: ones, for coverage."""
     intersections: TileIntersections
     grid: TileGrid
     settings: RasterSettings
@@ -172,7 +174,7 @@ class Met:
 
     tiles: Int[Tensor, "B"]
     entries: Int[Tensor, "B"]
-    """Of the list of intersections."""
+    """Indices into the list of intersections."""
     splats: Int[Tensor, "B"]
     row: Float[Tensor, "B 7"]
     """Positions relative to the middle of the tile."""
@@ -181,7 +183,7 @@ class Met:
 
 
 def walk(lists: Lists, tiles: Int[Tensor, "B"]) -> Iterator[Met]:
-    """All splats of some tiles, longest list first, front to back, as their windows meet them."""
+    """Yields the splats of some tiles front to back, with the windows that they meet."""
     grid, settings, like = lists.grid, lists.settings, lists.rows
     lengths, starts = lists.intersections.starts.diff()[tiles], lists.intersections.starts[tiles]
     step = settings.backend.on(like.device.type).kernel(behind_splat) if len(tiles) > 1 else behind_splat
@@ -205,17 +207,16 @@ def walk(lists: Lists, tiles: Int[Tensor, "B"]) -> Iterator[Met]:
 
 
 def batches(lists: Lists) -> Iterator[Int[Tensor, "B"]]:
-    """Tiles that have a list, longest first."""
+    """Yields tiles that have a list, longest first."""
     lengths = lists.intersections.starts.diff()
     order = torch.argsort(lengths, descending=True, stable=True)[: int((lengths > 0).sum())]
     yield from order.split(max(1, BATCH_PIXELS // lists.grid.tile**2))
 
 
 def blend_windows(lists: Lists, max_weights: Float[Tensor, "E"] | None) -> Float[Tensor, "T P C"]:
-    """Blended channels of every tile; `max_weights`, where given, receives each intersection's largest weight."""
-    pixels = lists.grid.tile**2
+    """Returns the blended channels of every tile; `max_weights`: receives each intersection's largest weight."""
     tiles = len(lists.intersections.starts) - 1
-    pictures = lists.channels.new_zeros(tiles, pixels, lists.channels.shape[1])
+    pictures = lists.channels.new_zeros(tiles, lists.grid.tile**2, lists.channels.shape[1])
     for batch in batches(lists):
         for met in walk(lists, batch):
             weight = met.before[0] * met.alpha
@@ -225,13 +226,15 @@ def blend_windows(lists: Lists, max_weights: Float[Tensor, "E"] | None) -> Float
     return pictures
 
 
-# -- gradients, as published: a splat's own, in the window that it met -----------------------------------------------
+# -- gradients, as published: of a splat in the window that it meets, not of that window -----------------------------
 
 
-def slopes(u: Axis, v: Axis, opacity: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Derivatives of the mean alpha, not clamped: by the opacity, by the offsets along both axes, by both variances and
-    by the off-diagonal entry in the frame of the axes. By the heat equation that of a variance is half the second
-    derivative by the offset, so that nothing is singular where both axes are alike."""
+def slopes(u: Axis, v: Axis, opacity: Tensor) -> tuple[Tensor, ...]:
+    """Returns derivatives of the mean alpha, not clamped, in the frame of the axes.
+
+    By opacity, both offsets, both variances and the off-diagonal entry. By the heat equation that of a variance is half
+    the second derivative by the offset: not singular where both axes are equal.
+    """
     area, unit = u.side * v.side, opacity
     (u0, _, u2), (v0, _, v2) = u.moments, v.moments
     (u_low, u_high), (v_low, v_high) = u.heights, v.heights
@@ -254,12 +257,11 @@ def slopes(u: Axis, v: Axis, opacity: Tensor) -> tuple[Tensor, Tensor, Tensor, T
         unit * middle * a * b / (u.sigma * v.sigma),
     )
     narrow = is_narrow(u, v)
-    by_opacity, by_u, by_v, by_uu, by_vv, by_uv = (torch.where(narrow, p, w) for p, w in zip(point, wide, strict=True))
-    return by_opacity, by_u, by_v, by_uu, by_vv, by_uv
+    return tuple(torch.where(narrow, p, w) for p, w in zip(point, wide, strict=True))
 
 
 def splat_gradients(met: Met, weight: Float[Tensor, "B P"]) -> Float[Tensor, "B P 6"]:
-    """`weight` times the derivatives of alpha by mean x, y, covariance xx, xy, yy and ln opacity, pixel by pixel."""
+    """Returns `weight` times the derivatives of alpha by mean x, y, covariance xx, xy, yy and ln opacity, by pixel."""
     columns = tuple(met.row.unsqueeze(2).unbind(1))
     u, v, _ = along_axes(met.before, columns)
     _, _, cos, sin, _, _, opacity = columns
@@ -280,40 +282,35 @@ def splat_gradients(met: Met, weight: Float[Tensor, "B P"]) -> Float[Tensor, "B 
 def gradients_of_lists(
     lists: Lists, pictures: Float[Tensor, "T P C"], gradient: Float[Tensor, "T P C"]
 ) -> tuple[Float[Tensor, "E 8"], Float[Tensor, "E C"]]:
-    """Of every intersection: gradients of mean, covariance and ln opacity, then the sums over pixels of the mean's
-    absolute gradients; and gradients of its channels. Windows are met again from the front."""
+    """Returns (gradients of mean, covariance and ln opacity, then absolute gradients of the mean; of channels).
+
+    One row per intersection. The windows are computed again, front to back.
+    """
     count = len(lists.intersections.splats)
     own, channels = lists.rows.new_zeros(count, 8), lists.rows.new_zeros(count, lists.channels.shape[1])
     passed = torch.zeros_like(pictures)
     for batch in batches(lists):
         for met in walk(lists, batch):
-            colour, seen = lists.channels[met.splats][:, None], gradient[met.tiles]
+            colour, by_colour = lists.channels[met.splats][:, None], gradient[met.tiles]
             weight = met.before[0] * met.alpha
             passed[met.tiles] += weight[..., None] * colour
             rest = (passed[met.tiles] - pictures[met.tiles]) / (1 - met.alpha)[..., None]
-            of_alpha = ((met.before[0][..., None] * colour + rest) * seen).sum(2) * (met.alpha > 0)
+            of_alpha = ((met.before[0][..., None] * colour + rest) * by_colour).sum(2) * (met.alpha > 0)
             parts = splat_gradients(met, of_alpha)
             own[met.entries] = torch.cat([parts.sum(1), parts[..., :2].abs().sum(1)], 1)
-            channels[met.entries] = (weight[..., None] * seen).sum(1)
+            channels[met.entries] = (weight[..., None] * by_colour).sum(1)
     return own, channels
 
 
 class WindowComposite(torch.autograd.Function):
-    """See `composite_windows`."""
+    """Blends the splats of `composite_windows`, which documents the gradient."""
 
     @staticmethod
     def forward(
         ctx, means, covariances, log_opacities, channels, absgrad, factors, intersections, grid, settings, most
     ):
-        ones = torch.ones_like(means[:, :1])
         rows = torch.cat([means, axes(covariances, factors), log_opacities.exp()[:, None]], 1)
-        lists = Lists(
-            rows=rows,
-            channels=torch.cat([channels, ones], 1),
-            intersections=intersections,
-            grid=grid,
-            settings=settings,
-        )
+        lists = Lists(rows, torch.cat([channels, torch.ones_like(means[:, :1])], 1), intersections, grid, settings)
         pictures = blend_windows(lists, most)
         ctx.kept = lists, pictures, absgrad is not None
         return grid.to_raster(pictures)
@@ -321,8 +318,7 @@ class WindowComposite(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient):
         lists, pictures, absolute = ctx.kept
-        seen = lists.grid.to_tiles(gradient).permute(0, 2, 1)
-        own, channels = gradients_of_lists(lists, pictures, seen)
+        own, channels = gradients_of_lists(lists, pictures, lists.grid.to_tiles(gradient).permute(0, 2, 1))
         values = torch.cat([own, channels[:, :-1]], 1)
         total = sum_by_splat(values, lists.intersections.splats, len(lists.rows))
         absgrad = total[:, 6:8] if absolute else None
@@ -338,11 +334,10 @@ def composite_windows(
 ) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
     """Blends by pixel windows; a `Compositor`.
 
-    The gradient is the published one: that a splat moves the windows of those behind it is left out, which the paper's
-    training does as well.
+    The gradient is the published one: it leaves out that a splat moves the windows of those behind it.
     """
     if settings.pixel != "window":
-        raise ConfigError("rasterizer.path=window draws pixel windows: give rasterizer.pixel=window instead")
+        raise ConfigError("rasterizer.path=window draws pixel windows: set rasterizer.pixel=window instead")
     means, factors = screen.means, screen.conic_factors.detach()
     exact = Precision.of(settings, means.dtype).exact
     most = means.new_zeros(len(intersections.splats), dtype=exact) if screen.weigh else None
