@@ -34,7 +34,7 @@ from gsx.experiments.reports.report import growth_chart
 from gsx.modules.bilateral_grid import RANK, apply_grid
 from gsx.modules.blur import Blur, BlurOptions
 from gsx.modules.exposure import Exposure, ExposureOptions
-from gsx.modules.movement import motion_blurred
+from gsx.modules.motion_blur import motion_blurred
 
 PUBLISHED = EventSteps(500, 15000, 100)
 """3D-GS: steps 600, 700, ... 14900."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, pinhole
-from gsx.modules.alignment import Motion, aligned, moved, rotation_by
+from gsx.modules.alignment import Motion, estimate_camera, move_camera, rotation_by
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 220.0
 AT_ORIGIN = pinhole(torch.eye(3), torch.zeros(3), FOCAL, WIDTH, HEIGHT)
@@ -39,13 +39,15 @@ def picture(camera: Camera) -> tuple[Tensor, Tensor]:
 def elsewhere(turn: tuple[float, float, float], move: tuple[float, float, float]) -> Camera:
     """The camera turned by so many px at its focal length, and moved."""
     vector = torch.tensor(turn, dtype=torch.float64) / FOCAL
-    return moved(AT_ORIGIN, Motion(rotation=rotation_by(vector), move=torch.tensor(move, dtype=torch.float64)))
+    return move_camera(AT_ORIGIN, Motion(rotation=rotation_by(vector), move=torch.tensor(move, dtype=torch.float64)))
 
 
 def found_for(taken: Camera, counted: Tensor | None = None, gain: float = 1.0) -> Camera:
     """Where a photograph taken there is found to be taken, from a render at the origin."""
     image, depth = picture(AT_ORIGIN)
-    return aligned(AT_ORIGIN, image, depth, torch.ones_like(depth), gain * picture(taken)[0] + 1 - gain, counted)
+    return estimate_camera(
+        AT_ORIGIN, image, depth, torch.ones_like(depth), gain * picture(taken)[0] + 1 - gain, counted
+    )
 
 
 def off(one: Camera, other: Camera) -> tuple[float, float]:
@@ -85,26 +87,26 @@ def test_what_stands_in_the_way_hardly_counts_and_what_is_masked_does_not_at_all
     image, depth = picture(AT_ORIGIN)
     photograph = picture(taken)[0]
     photograph[:, 60:100, 80:120] = 1.0
-    found = aligned(AT_ORIGIN, image, depth, torch.ones_like(depth), photograph, None)
+    found = estimate_camera(AT_ORIGIN, image, depth, torch.ones_like(depth), photograph, None)
     assert beside(found, taken) < 0.1
     photograph[:, :, :100] = picture(elsewhere((-3.0, 3.0, 0.0), (0.0, 0.0, 0.0)))[0][:, :, :100]
     counted[:, :120] = False
-    found = aligned(AT_ORIGIN, image, depth, torch.ones_like(depth), photograph, counted)
+    found = estimate_camera(AT_ORIGIN, image, depth, torch.ones_like(depth), photograph, counted)
     assert beside(found, taken) < 0.1
 
 
 def test_a_plain_picture_moves_nothing_and_no_depth_tells_nothing() -> None:
     image, depth = picture(AT_ORIGIN)
     plain = torch.full_like(image, 0.5)
-    assert beside(aligned(AT_ORIGIN, plain, depth, torch.ones_like(depth), plain, None), AT_ORIGIN) < 1e-6
+    assert beside(estimate_camera(AT_ORIGIN, plain, depth, torch.ones_like(depth), plain, None), AT_ORIGIN) < 1e-6
     other = picture(elsewhere((1.0, 1.0, 0.0), (0.0, 0.0, 0.0)))[0]
-    assert aligned(AT_ORIGIN, image, 0 * depth, torch.zeros_like(depth), other, None) is AT_ORIGIN
+    assert estimate_camera(AT_ORIGIN, image, 0 * depth, torch.zeros_like(depth), other, None) is AT_ORIGIN
 
 
 def test_what_pictures_do_not_tell_goes_back_to_the_given_pose() -> None:
     astray = elsewhere((2.0, -1.0, 0.5), (0.05, 0.0, -0.02))
     plain, depth = torch.full((3, HEIGHT, WIDTH), 0.5), picture(AT_ORIGIN)[1]
-    back = aligned(astray, plain, depth, torch.ones_like(depth), plain, None, given=AT_ORIGIN)
+    back = estimate_camera(astray, plain, depth, torch.ones_like(depth), plain, None, prior=AT_ORIGIN)
     angle, distance = off(back, AT_ORIGIN)
     assert angle < 0.05
     assert distance < 0.001
@@ -116,8 +118,11 @@ def test_a_pose_that_may_be_far_off_is_held_less() -> None:
     taken, (image, depth) = elsewhere((2.0, 0.0, 0.0), (0.0, 0.0, 0.0)), picture(AT_ORIGIN)
     photograph = picture(taken)[0] + 0.2 * torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
     moves = [
-        beside(aligned(AT_ORIGIN, image, depth, torch.ones_like(depth), photograph, None, held=held), AT_ORIGIN)
-        for held in (25000, 1000, 62.5)
+        beside(
+            estimate_camera(AT_ORIGIN, image, depth, torch.ones_like(depth), photograph, None, prior_weight=weight),
+            AT_ORIGIN,
+        )
+        for weight in (25000, 1000, 62.5)
     ]
     assert moves[0] < 0.3
     assert moves[1] == pytest.approx(1.4, abs=0.3)
@@ -127,7 +132,7 @@ def test_a_pose_that_may_be_far_off_is_held_less() -> None:
 def test_depth_is_that_of_what_covers_a_pixel() -> None:
     """The rasterizer sums depth by weights that add up to alpha."""
     taken, (image, depth) = elsewhere((0.0, 0.0, 0.0), (0.06, -0.04, 0.08)), picture(AT_ORIGIN)
-    found = aligned(AT_ORIGIN, image, 0.8 * depth, torch.full_like(depth, 0.8), picture(taken)[0], None)
+    found = estimate_camera(AT_ORIGIN, image, 0.8 * depth, torch.full_like(depth, 0.8), picture(taken)[0], None)
     assert beside(found, taken) < 0.05
 
 
@@ -139,7 +144,7 @@ def test_before_a_distant_wall_a_turn_is_not_taken_for_a_move() -> None:
         return (0.5 + 0.2 * (0.2 * (x - across)).sin() + 0.2 * (0.15 * y).cos()).expand(3, -1, -1).contiguous()
 
     depth = torch.full((HEIGHT, WIDTH), 1000.0)
-    found = aligned(AT_ORIGIN, flat(0.0), depth, torch.ones_like(depth), flat(1.5), None)
+    found = estimate_camera(AT_ORIGIN, flat(0.0), depth, torch.ones_like(depth), flat(1.5), None)
     point = torch.tensor([[0.0, 0.0, 1000.0]])
     assert found.project(point)[0][0, 0] - AT_ORIGIN.project(point)[0][0, 0] == pytest.approx(1.5, abs=0.1)
     assert off(found, AT_ORIGIN)[0] < 3
@@ -148,6 +153,6 @@ def test_before_a_distant_wall_a_turn_is_not_taken_for_a_move() -> None:
 def test_a_camera_stays_one_over_many_motions() -> None:
     camera = replace(AT_ORIGIN, rotation=1.001 * torch.eye(3))  # as if rounding had stretched it
     for _ in range(20):
-        camera = moved(camera, Motion(rotation=rotation_by(torch.tensor([0.1, 0.02, -0.05]).double()),
+        camera = move_camera(camera, Motion(rotation=rotation_by(torch.tensor([0.1, 0.02, -0.05]).double()),
                                       move=torch.zeros(3, dtype=torch.float64)))  # fmt: skip
     torch.testing.assert_close(camera.rotation @ camera.rotation.T, torch.eye(3), atol=1e-6, rtol=0)

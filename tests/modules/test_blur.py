@@ -22,8 +22,7 @@ from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.halves import made
 from gsx.experiments.runs.open import open_run
 from gsx.modules.blur import Blur, BlurOptions
-from gsx.modules.motion_blur import Movement
-from gsx.modules.movement import motion_blurred
+from gsx.modules.motion_blur import Movement, motion_blurred
 
 LONG, SHORT, IDLE = Movement(3.0, 4.0, 0.2), Movement(0.5, 0.5, 0.2), Movement(3.0, 4.0, 0.001)
 

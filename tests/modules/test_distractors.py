@@ -18,7 +18,7 @@ from gsx.core.errors import Stopped
 from gsx.experiments.runs.degraded import patch_of
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
-from gsx.modules.coarser import coarser
+from gsx.modules.derived_views import reduce_view
 from gsx.modules.distractors import (
     DistractorOptions,
     Distractors,
@@ -79,7 +79,7 @@ def test_a_coarse_pixel_counts_where_nothing_of_it_is_marked(times: int) -> None
     view = View("a", views()[0].camera.resize(650, 523), Grey())
     marked = torch.zeros(523 // 4, 650 // 4, dtype=torch.bool)
     marked[40:60, 60:81] = True  # rows 160 to 240, columns 240 to 324
-    coarse = coarser(view, Reduction(), times)
+    coarse = reduce_view(view, Reduction(), times)
     assert coarse.camera.size == (650 // times, 523 // times)
     found, picture = mask_view(coarse, marked), coarse.source.image(coarse.camera)
     expected = torch.ones(523 // times, 650 // times, dtype=torch.bool)

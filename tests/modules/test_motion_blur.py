@@ -7,8 +7,15 @@ import torch
 from torch import Tensor, fft
 from torch.nn.functional import avg_pool2d
 
-from gsx.modules.motion_blur import MOST, error_after, left_by, movement_between, spectra_of
-from gsx.modules.movement import line_kernel, motion_blurred
+from gsx.modules.motion_blur import (
+    LONGEST,
+    error_after,
+    kernel_spectrum,
+    line_kernel,
+    motion_blurred,
+    movement_between,
+    spectra_of,
+)
 
 
 def picture(seed: int = 0) -> Tensor:
@@ -143,7 +150,7 @@ def test_a_model_that_is_blurred_along_a_line_makes_photographs_look_moved_acros
 
 def test_no_movement_is_longer_than_the_longest() -> None:
     found = movement_between(picture(), motion_blurred(picture(), 60.0, 0.0))
-    assert 12 < abs(found.across) <= MOST
+    assert 12 < abs(found.across) <= LONGEST
 
 
 @pytest.mark.parametrize("movement", [(2.0, 0.0), (-6.0, 3.0), (0.5, 9.0), (0.0, 0.0)])
@@ -151,7 +158,7 @@ def test_what_a_movement_leaves_is_the_spectrum_of_its_kernel(movement: tuple[fl
     kernel, around = line_kernel(*movement), torch.zeros(120, 160, dtype=torch.float64)
     around[: len(kernel), : len(kernel)] = kernel
     truth = fft.rfft2(around.roll((-(len(kernel) // 2),) * 2, (0, 1)))
-    found = left_by(movement, spectra_of(picture()[0], picture()[0], None))
+    found = kernel_spectrum(movement, spectra_of(picture()[0], picture()[0], None))
     torch.testing.assert_close(found, truth.real, atol=1e-12, rtol=0)
     assert truth.imag.abs().max() < 1e-12
 
@@ -163,7 +170,7 @@ def test_the_gain_of_a_ring_is_free_and_that_of_a_direction_is_not() -> None:
     assert int(spectra.ring[spectra.sharp > 0].max()) == 32, "half a cycle per px"
     for ring in range(33):
         here = spectra.ring == ring
-        after = left_by((3.0, 1.0), spectra)[here]
+        after = kernel_spectrum((3.0, 1.0), spectra)[here]
         gain = max(0.0, float((spectra.shared[here] * after).sum() / (spectra.sharp[here] * after**2).sum()))
         left += float((gain**2 * spectra.sharp[here] * after**2 - 2 * gain * spectra.shared[here] * after).sum())
     assert error_after((3.0, 1.0), spectra) == pytest.approx(spectra.photograph + left, rel=1e-9)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
-from gsx.modules.movement import DAMPING, blurred_to_learn, line_kernel, motion_blurred, sharpened
+from gsx.modules.motion_blur import DAMPING, SharpenedBlur, line_kernel, motion_blurred, sharpened
 
 
 def shifted(image: Tensor, across: float, down: float) -> Tensor:
@@ -85,4 +85,4 @@ def error_after(steps: int, blur: Callable[[Tensor, float, float], Tensor]) -> f
 
 
 def test_a_sharp_picture_is_learnt_from_a_blurred_one_in_a_fifth_of_the_steps() -> None:
-    assert error_after(10, blurred_to_learn) < error_after(50, motion_blurred)
+    assert error_after(10, SharpenedBlur.apply) < error_after(50, motion_blurred)

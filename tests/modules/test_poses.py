@@ -26,17 +26,16 @@ from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
 from gsx.modules import poses as poses_module
-from gsx.modules.alignment import Motion, moved, rotation_by
+from gsx.modules.alignment import Motion, move_camera, rotation_by
+from gsx.modules.derived_views import FixedPoseSource, change_pose
 from gsx.modules.distractors import DistractorOptions
-from gsx.modules.photo_pairs import render_reduced
-from gsx.modules.pinned import Taken, posed
+from gsx.modules.photo_pairs import render_reduced, shared_spread
 from gsx.modules.poses import (
     PoseOptions,
     Poses,
     half_shifts,
     in_moved_world,
     motion_px,
-    shift_spread,
     usual_shift,
     without_common,
 )
@@ -63,7 +62,7 @@ def cameras(count: int = 8) -> list[Camera]:
 
 def nudged(camera: Camera, twist: Tensor) -> Camera:
     """The camera after a turn, rad, and a move."""
-    return moved(camera, Motion(rotation=rotation_by(twist[:3]), move=twist[3:]))
+    return move_camera(camera, Motion(rotation=rotation_by(twist[:3]), move=twist[3:]))
 
 
 # -- when ----------------------------------------------------------------------------------------------------------
@@ -132,7 +131,7 @@ def waves(across: float, down: float) -> Tensor:
 
 def spread_between(pictures: Iterable[tuple[Tensor, Tensor, None, float]]) -> float:
     """The spread of shifts of pictures."""
-    return shift_spread(half_shifts(pictures))
+    return shared_spread(*half_shifts(pictures).unbind(1))
 
 
 def test_the_spread_of_shifts_is_that_of_poses() -> None:
@@ -155,7 +154,7 @@ def test_a_usual_shift_is_that_of_most_photographs() -> None:
     noisy[:20] = 40.0
     noisy[20:30] = math.nan
     assert usual_shift(noisy) == pytest.approx(0.8, rel=0.2)
-    assert shift_spread(noisy) > 5
+    assert shared_spread(*noisy.unbind(1)) > 5
     assert usual_shift(torch.full((4, 2, 2), math.nan)) == 0
 
 
@@ -221,15 +220,15 @@ class File(Asked):
 def test_the_photograph_stays_when_the_pose_changes() -> None:
     one, other = cameras()[:2]
     source = Asked()
-    view = posed(posed(View("a", one, source), other), cameras()[2])
+    view = change_pose(change_pose(View("a", one, source), other), cameras()[2])
     view.zoom(2).image()
     assert torch.equal(view.camera.rotation, cameras()[2].rotation)
     assert torch.equal(source.camera.rotation, one.rotation)
     assert torch.equal(source.camera.translation, one.translation)
     assert source.camera.width == 2 * one.width
     file = File()
-    assert posed(View("a", one, file), other).source is file  # files do not know poses
-    assert isinstance(view.source, Taken)
+    assert change_pose(View("a", one, file), other).source is file  # files do not know poses
+    assert isinstance(view.source, FixedPoseSource)
 
 
 def test_views_are_the_same_until_poses_change() -> None:
@@ -311,9 +310,9 @@ def test_a_run_with_corrected_poses_resumes_as_if_never_stopped(corrected: tuple
     run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
     assert run.modules["poses"].matrices is not None
     assert (run.modules["poses"].last_estimate, run.modules["poses"].error) == (2, 1.7312345678901233)
-    with patch.object(poses_module, "aligned", wraps=poses_module.aligned) as corrections:
+    with patch.object(poses_module, "estimate_camera", wraps=poses_module.estimate_camera) as corrections:
         execute(run, settings, plugins())
-    held = [call.kwargs["held"] for call in corrections.call_args_list]
+    held = [call.kwargs["prior_weight"] for call in corrections.call_args_list]
     assert held == pytest.approx([250 / (0.5 * 1.7312345678901233)] * 6 + [1000] * 6)
     a, b = final_tensors(folder), final_tensors(tmp_path / "stopped")
     assert a.keys() == b.keys()

@@ -17,7 +17,7 @@ from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.quality.losses import ssim_map
 from gsx.core.quality.metrics import psnr, ssim
-from gsx.modules.coarser import coarser
+from gsx.modules.derived_views import reduce_view
 from gsx.scenes.masked import candidates, masks_named
 from gsx.scenes.photo_source import PhotoSource
 from tests.synthetic_colmap import synthesize, write_scene
@@ -91,7 +91,7 @@ def test_no_masked_pixel_reaches_a_counted_one_of_a_coarse_view(filter):
     camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=160, height=128)
     for times in (2, 4):
         views = [
-            coarser(View("a", camera, Photo(picture)), Reduction(filter=filter), times)
+            reduce_view(View("a", camera, Photo(picture)), Reduction(filter=filter), times)
             for picture in (one, torch.where(excluded, 255 - one, one))
         ]
         counted = views[0].counted()

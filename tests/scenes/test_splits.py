@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from gsx.core.data.images import write_image
 from gsx.core.errors import ConfigError, InputError
-from gsx.modules.movement import motion_blurred
+from gsx.modules.motion_blur import motion_blurred
 from gsx.scenes.splits import parse_rule, split_names
 
 NAMES = [f"{i:02d}.jpg" for i in range(17)]

@@ -1,11 +1,9 @@
-"""Where a photograph was taken, told from what a model shows near there.
+"""Pose of the camera that took a photo, estimated from a render near it.
 
-A model is drawn by a camera, with depth z. The pixel at p shows the point X = z ((p - c) / f, 1) of the camera's frame;
-a photograph that was taken from elsewhere shows it at pi(R X + t), (R, t) being the motion from the camera to where it
-was taken. The motion sought is the one whose photograph explains the render best, beside a gain and an offset: by least
-squares on slopes of the photograph, looked up there again and again (Lucas and Kanade 1981), coarse to fine, in which
-pixels that differ by more than the usual count little. Directions that pictures do not tell (a turn from a move, before
-a distant wall) are held by a prior.
+A render with depth z has the point X = z ((p - c) / f, 1) of the camera's frame at pixel p; a photo from a pose (R, t)
+relative to that camera has it at pi(R X + t). The estimate is the (R, t) that fits the photo to the render best up to a
+gain and an offset: robust least squares on slopes of the photo (Lucas and Kanade 1981), coarse to fine. A prior holds
+directions that images do not determine (a turn from a move, in front of a distant wall).
 """
 
 from dataclasses import dataclass, replace
@@ -19,39 +17,50 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.masks import grown
 from gsx.core.shapes import Bool, Float
 from gsx.formats.turned import cross_matrix
-from gsx.modules.shifts import ALIKE, BORDER, LEAST, SMALLEST, by_medians, central, grey, robust
+from gsx.modules.image_shift import (
+    BORDER,
+    MIN_PIXELS,
+    MIN_SIDE,
+    NEGLIGIBLE,
+    Grey,
+    Mask,
+    median_residual,
+    robust_weights,
+    slope,
+    smoothed_grey,
+)
 
-ROUNDS, ENOUGH = 10, 0.02
-"""Of the search at each size; px, of the last of them."""
+ROUNDS, MIN_STEP = 10, 0.02
+"""Most iterations at each size; step at which they end, px."""
 COVERED = 0.5
-"""Alpha of a pixel that has a depth."""
-HELD = 1000.0
-"""Pixels that say as much as the prior does of a pose that is wrong by 1 px, where nothing is known of its error."""
+"""Least alpha of a pixel that has a depth."""
+PRIOR_WEIGHT = 1000.0
+"""Pixels that weigh as much as the prior of a pose that is 1 px off, where its error is unknown."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Motion:
-    """From one camera's frame to another's: X' = rotation X + move. float64."""
+    """A motion from one camera's frame to another's: X' = rotation X + move. float64."""
 
     rotation: Float[Tensor, "3 3"]
     move: Float[Tensor, "3"]
     """Scene units."""
 
-    def of(self, points: Float[Tensor, "3 P"]) -> Float[Tensor, "3 P"]:
-        """Points of the first frame in the second."""
+    def apply(self, points: Float[Tensor, "3 P"]) -> Float[Tensor, "3 P"]:
+        """Returns points of the first frame in the second."""
         return self.rotation @ points + self.move[:, None]
 
     def twist(self) -> Float[Tensor, "6"]:
-        """Rotation vector, rad, and move; of small rotations."""
+        """Returns rotation vector, rad, and move; for small rotations."""
         skew = (self.rotation - self.rotation.T) / 2
         return torch.cat([torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]]), self.move])
 
     def after(self, other: "Motion") -> "Motion":
-        """The other one, and then this."""
-        return Motion(rotation=self.rotation @ other.rotation, move=self.of(other.move[:, None])[:, 0])
+        """Returns the composition: `other` first, then this."""
+        return Motion(rotation=self.rotation @ other.rotation, move=self.apply(other.move[:, None])[:, 0])
 
     def then(self, turn: Float[Tensor, "3"], move: Float[Tensor, "3"]) -> "Motion":
-        """This, and then a rotation vector, rad, and a move."""
+        """Returns the composition: this first, then a rotation vector, rad, and a move."""
         rotation = rotation_by(turn)
         return Motion(rotation=rotation @ self.rotation, move=rotation @ self.move + move)
 
@@ -60,196 +69,193 @@ STILL = Motion(rotation=torch.eye(3, dtype=torch.float64), move=torch.zeros(3, d
 
 
 def rotation_by(turn: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The rotation about a vector by its length, rad."""
+    """Returns the rotation about a vector by its length, rad."""
     return torch.linalg.matrix_exp(cross_matrix(turn))
 
 
 def motion_to(camera: Camera, other: Camera) -> Motion:
-    """From one camera's frame to another's."""
+    """Returns the motion from one camera's frame to another's."""
     rotation = other.rotation.double() @ camera.rotation.double().T
     return Motion(rotation=rotation, move=other.translation.double() - rotation @ camera.translation.double())
 
 
-def moved(camera: Camera, motion: Motion) -> Camera:
-    """The camera where the motion leads."""
+def move_camera(camera: Camera, motion: Motion) -> Camera:
+    """Returns the camera after a motion of its frame."""
     rotation, translation = camera.rotation.double(), camera.translation.double()
-    # to a rotation again: what rounding adds up over many motions would stretch it
+    # a rotation again: rounding of many motions would stretch it
     u, _, v = torch.linalg.svd(motion.rotation @ rotation)
     translation = motion.rotation @ translation + motion.move
     return replace(camera, rotation=(u @ v).to(camera.rotation), translation=translation.to(camera.translation))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Shown:
-    """What a model shows to a camera, float64."""
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A render with depth, float64, and what limits its alignment with a photo."""
 
     camera: Camera
-    image: Float[Tensor, "H W"]
+    image: Grey
     depth: Float[Tensor, "H W"]
     """Camera z, scene units."""
-    inside: Bool[Tensor, "H W"]
+    inside: Mask
     """Pixels that have a depth and count."""
-    counted: Bool[Tensor, "H W"] | None = None
-    """Pixels of the photograph that are looked at; None: all."""
-    given: Motion = STILL
-    """From the pose that the prior holds to that of the camera."""
-    held: float
-    """Pixels that say as much as the prior does of a pose that is wrong by 1 px: as many at half the size, where as
-    large a part of the scene, and as wrong a pose, have a quarter of the pixels and half of the px."""
+    mask: Mask | None
+    """Pixels of the photo that count; None: all."""
+    offset: Motion
+    """From the prior's pose to that of the camera."""
+    prior_weight: float
+    """See `estimate_camera`. The same at half the size: a quarter of the pixels, half of the px."""
 
     def points(self) -> Float[Tensor, "3 P"]:
-        """What pixels inside show, in the camera's frame."""
+        """Returns the points of pixels inside, in the camera's frame."""
         camera, (y, x) = self.camera, self.inside.nonzero(as_tuple=True)
         across, down = (x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy
         return torch.stack([across, down, torch.ones_like(across)]) * self.depth[self.inside]
 
-    def halved(self) -> "Shown":
-        """At half the size; pixels count of which all four do."""
+    def halved(self) -> "Reference":
+        """Returns the render at half the size; a pixel counts if all four do."""
         width, height = (side // 2 for side in self.camera.size)
         image, depth, inside = (
             avg_pool2d(values[None].double(), 2)[0] for values in (self.image, self.depth, self.inside)
         )
         camera = self.camera.crop(0, 0, 2 * width, 2 * height).resize(width, height)
-        counted = None if self.counted is None else avg_pool2d(self.counted[None].double(), 2)[0] == 1
-        return replace(self, camera=camera, image=image, depth=depth, inside=inside == 1, counted=counted)
+        mask = None if self.mask is None else avg_pool2d(self.mask[None].double(), 2)[0] == 1
+        return replace(self, camera=camera, image=image, depth=depth, inside=inside == 1, mask=mask)
 
     @cached_property
-    def masked(self) -> Float[Tensor, "1 H W"] | None:
-        """1 near pixels of the photograph that do not count, else 0; None: all count."""
-        return None if self.counted is None else grown(~self.counted[None], BORDER).double()
+    def excluded(self) -> Float[Tensor, "1 H W"] | None:
+        """1 near pixels of the photo that do not count, else 0; None: all count."""
+        return None if self.mask is None else grown(~self.mask[None], BORDER).double()
 
-    def seen(self, points: Float[Tensor, "3 P"]) -> tuple[Float[Tensor, "2 P"], Bool[Tensor, "P"]]:
-        """(where points of a camera's frame are seen, px; which of them, before the camera, and not near a border of
-        the photograph or what does not count of it)."""
-        pixels, told = seen_at(self.camera, points)
-        return pixels, told if self.masked is None else told & (looked_up(self.masked, pixels, "nearest")[0] == 0)
+    def project(self, points: Float[Tensor, "3 P"]) -> tuple[Float[Tensor, "2 P"], Bool[Tensor, "P"]]:
+        """Projects points; returns (px, which lie in front of the camera, away from borders and excluded pixels)."""
+        camera, (x, y, z) = self.camera, points
+        deep = z.clamp_min(max(camera.near, 1e-9))
+        across, down = camera.fx * x / deep + camera.cx, camera.fy * y / deep + camera.cy
+        valid = (z > camera.near) & (across > BORDER) & (across < camera.width - BORDER)
+        pixels, valid = torch.stack([across, down]), valid & (down > BORDER) & (down < camera.height - BORDER)
+        if self.excluded is not None:
+            valid = valid & (sample_image(self.excluded, pixels, "nearest")[0] == 0)
+        return pixels, valid
 
 
-def aligned(
+def estimate_camera(
     camera: Camera,
     image: Float[Tensor, "3 H W"],
     depth: Float[Tensor, "H W"],
     alpha: Float[Tensor, "H W"],
-    photograph: Float[Tensor, "3 H W"],
-    counted: Bool[Tensor, "H W"] | None,
-    given: Camera | None = None,
-    held: float = HELD,
+    photo: Float[Tensor, "3 H W"],
+    mask: Mask | None,
+    prior: Camera | None = None,
+    prior_weight: float = PRIOR_WEIGHT,
 ) -> Camera:
-    """The camera where a photograph was taken, from a render near there; as it is where pictures do not tell.
+    """Estimates the camera that took a photo from a render near it; unchanged where images do not determine it.
 
-    depth: blending-weighted sum of camera z, scene units, as the rasterizer has it. given: whose pose the prior holds;
-    None: that of the camera. held: pixels that say as much as that of a pose that is wrong by 1 px.
+    depth: blending-weighted sum of camera z, scene units. mask: pixels of the photo that count. prior: pose that the
+    prior holds (None: the camera's). prior_weight: pixels that weigh as much as the prior of a pose that is 1 px off.
     """
     inside = (alpha > COVERED) & (depth > camera.near * alpha)
-    inside = inside if counted is None else inside & counted.to(inside.device)
+    mask = None if mask is None else mask.to(inside.device)
+    inside = inside if mask is None else inside & mask
     z = torch.where(inside, depth.double() / alpha.double().clamp_min(COVERED), 1.0)
-    wanted, from_given = grey(photograph), STILL if given is None else motion_to(given, camera)
-    counted = None if counted is None else counted.to(inside.device)
-    shown = Shown(
-        camera=camera, image=grey(image), depth=z, inside=inside, counted=counted, given=from_given, held=held
-    )
-    found = motion_between(shown, wanted)
-    if found is None or not mismatch(shown, wanted, found) <= mismatch(shown, wanted, STILL) + ALIKE:
+    target, offset = smoothed_grey(photo), STILL if prior is None else motion_to(prior, camera)
+    reference = Reference(camera, smoothed_grey(image), z, inside, mask, offset, prior_weight)
+    motion = estimate_motion(reference, target)
+    if motion is None or not mismatch(reference, target, motion) <= mismatch(reference, target, STILL) + NEGLIGIBLE:
         return camera
-    return moved(camera, found)
+    return move_camera(camera, motion)
 
 
-def usual_depth(depth: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"]) -> float:
-    """Median camera z of what covers pixels, scene units; nan where nothing does."""
+def median_depth(depth: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"]) -> float:
+    """Returns the median camera z of covered pixels, scene units; nan without any."""
     covered = alpha > COVERED
     return float((depth[covered] / alpha[covered]).median()) if covered.any() else float("nan")
 
 
-def motion_between(shown: Shown, photograph: Float[Tensor, "H W"]) -> Motion | None:
-    """From the camera to where a photograph was taken, coarse to fine; None where nothing tells."""
+def estimate_motion(reference: Reference, photo: Grey) -> Motion | None:
+    """Estimates the motion to the photo's pose, coarse to fine; None where pixels do not determine it."""
     start = None
-    if min(photograph.shape) >= 2 * SMALLEST:
-        start = motion_between(shown.halved(), avg_pool2d(photograph[None], 2)[0])
-    return refined(shown, photograph, start or STILL)
+    if min(photo.shape) >= 2 * MIN_SIDE:
+        start = estimate_motion(reference.halved(), avg_pool2d(photo[None], 2)[0])
+    return refine(reference, photo, start or STILL)
 
 
-def refined(shown: Shown, photograph: Float[Tensor, "H W"], motion: Motion) -> Motion | None:
-    """The motion found from one near to it; None where nothing tells, or it runs away."""
-    if int(shown.inside.sum()) < LEAST:
+def refine(reference: Reference, photo: Grey, motion: Motion) -> Motion | None:
+    """Refines a motion; None where pixels do not determine it, or it diverges."""
+    if int(reference.inside.sum()) < MIN_PIXELS:
         return None
-    points, still = shown.points(), shown.image[shown.inside]
-    # px to rad, and to scene units at the usual depth: steps in px are alike in what they change
-    unit = still.new_tensor([1.0] * 3 + [float(points[2].median())] * 3) / shown.camera.focal
-    slopes = torch.stack([central(photograph, 1), central(photograph, 0)])
+    points, values = reference.points(), reference.image[reference.inside]
+    # px to rad, and to scene units at the median depth: steps in px have effects of one size
+    unit = values.new_tensor([1.0] * 3 + [float(points[2].median())] * 3) / reference.camera.focal
+    slopes = torch.stack([slope(photo, 1), slope(photo, 0)])
     residual = None
     for _ in range(ROUNDS):
-        there = motion.of(points)
-        pixels, told = shown.seen(there)
-        if int(told.sum()) < LEAST:
+        moved = motion.apply(points)
+        pixels, valid = reference.project(moved)
+        if int(valid.sum()) < MIN_PIXELS:
             return None
-        [wanted], (right, down) = looked_up(photograph[None], pixels), looked_up(slopes, pixels, "bilinear")
-        motions = unit[:, None] * by_motion(shown.camera, there, right, down)
-        columns = torch.cat([-motions, still[None], torch.ones_like(still)[None]])
-        residual = by_medians(still, wanted, told) if residual is None else residual
-        off = motion.after(shown.given).twist() / unit
-        fit = held_least_squares(columns[:, told], wanted[told], residual[told], off, shown.held)
-        residual = wanted - fit @ columns
+        [target], (right, down) = sample_image(photo[None], pixels), sample_image(slopes, pixels, "bilinear")
+        motions = unit[:, None] * motion_slopes(reference.camera, moved, right, down)
+        columns = torch.cat([-motions, values[None], torch.ones_like(values)[None]])
+        residual = median_residual(values, target, valid) if residual is None else residual
+        off = motion.after(reference.offset).twist() / unit
+        fit = fit_with_prior(columns[:, valid], target[valid], residual[valid], off, reference.prior_weight)
+        residual = target - fit @ columns
         step = fit[:6]
         motion = motion.then(unit[:3] * step[:3], unit[3:] * step[3:])
-        if not bool((motion.twist() / unit).abs().max() < min(photograph.shape) / 4):
+        if not bool((motion.twist() / unit).abs().max() < min(photo.shape) / 4):
             return None
-        if bool(step.abs().max() < ENOUGH):
+        if bool(step.abs().max() < MIN_STEP):
             break
     return motion
 
 
-def seen_at(camera: Camera, points: Float[Tensor, "3 P"]) -> tuple[Float[Tensor, "2 P"], Bool[Tensor, "P"]]:
-    """(where points of a camera's frame are seen, px; which of them, before the camera and not near a border)."""
-    x, y, z = points
-    deep = z.clamp_min(max(camera.near, 1e-9))
-    across, down = camera.fx * x / deep + camera.cx, camera.fy * y / deep + camera.cy
-    told = (z > camera.near) & (across > BORDER) & (across < camera.width - BORDER)
-    return torch.stack([across, down]), told & (down > BORDER) & (down < camera.height - BORDER)
-
-
-def looked_up(
+def sample_image(
     images: Float[Tensor, "C H W"], pixels: Float[Tensor, "2 P"], mode: str = "bicubic"
 ) -> Float[Tensor, "C P"]:
-    """Values between pixels."""
+    """Returns values of images at positions, px."""
     places = 2 * pixels.T / pixels.new_tensor([images.shape[2], images.shape[1]]) - 1
-    found = grid_sample(images[None], places[None, None], mode=mode, padding_mode="border", align_corners=False)
-    return found[0, :, 0]
+    values = grid_sample(images[None], places[None, None], mode=mode, padding_mode="border", align_corners=False)
+    return values[0, :, 0]
 
 
-def by_motion(
+def motion_slopes(
     camera: Camera, points: Float[Tensor, "3 P"], right: Float[Tensor, "P"], down: Float[Tensor, "P"]
 ) -> Float[Tensor, "6 P"]:
-    """How values change with a turn, per rad, and a move, per scene unit, of the points they are looked up for; `right`
-    and `down`: their slopes, per px."""
+    """Returns the change of values with a turn, per rad, and a move, per scene unit, of the points that show them.
+
+    `right` and `down`: slopes of the values, per px.
+    """
     x, y, z = points
     across, along = right * camera.fx / z, down * camera.fy / z
     by_point = torch.stack([across, along, -(across * x + along * y) / z])
     return torch.cat([torch.linalg.cross(points, by_point, dim=0), by_point])
 
 
-def held_least_squares(
+def fit_with_prior(
     columns: Float[Tensor, "8 P"],
-    wanted: Float[Tensor, "P"],
+    target: Float[Tensor, "P"],
     residual: Float[Tensor, "P"],
     off: Float[Tensor, "6"],
-    held: float,
+    prior_weight: float,
 ) -> Float[Tensor, "8"]:
-    """Factors of columns whose sum comes closest to what is wanted. The first six are a step, px, from a pose that is
-    `off` that of the prior, which says as much as so many pixels; robust by the residuals of the last round."""
-    weights = robust(residual)
+    """Returns coefficients of columns that fit the target, robust by the last residuals, with a prior.
+
+    The first six are a step, px, from a pose that is `off` from the prior's.
+    """
+    weights = robust_weights(residual)
     variance = float((weights * residual.square()).sum() / weights.sum())
-    hold = wanted.new_full((8,), 1e-9 * len(wanted))  # what is plain has no slopes, and no gain beside its offset
-    hold[:6] += variance * held
-    system, right = (columns * weights) @ columns.T + torch.diag(hold), (columns * weights) @ wanted
+    hold = target.new_full((8,), 1e-9 * len(target))  # a flat image has no slopes, and no gain apart from its offset
+    hold[:6] += variance * prior_weight
+    system, right = (columns * weights) @ columns.T + torch.diag(hold), (columns * weights) @ target
     right[:6] -= hold[:6] * off
     scale = system.diagonal().sqrt()
     return torch.linalg.solve(system / scale / scale[:, None], right / scale) / scale
 
 
-def mismatch(shown: Shown, photograph: Float[Tensor, "H W"], motion: Motion) -> float:
-    """Median of what a motion leaves, brought to the same median; infinite where nothing tells."""
-    points, still = shown.points(), shown.image[shown.inside]
-    pixels, told = shown.seen(motion.of(points))
-    if not told.any():
+def mismatch(reference: Reference, photo: Grey, motion: Motion) -> float:
+    """Returns the median difference after a motion, at the same median; infinite without valid pixels."""
+    values = reference.image[reference.inside]
+    pixels, valid = reference.project(motion.apply(reference.points()))
+    if not valid.any():
         return float("inf")
-    return float(by_medians(still, looked_up(photograph[None], pixels)[0], told)[told].abs().median())
+    return float(median_residual(values, sample_image(photo[None], pixels)[0], valid)[valid].abs().median())

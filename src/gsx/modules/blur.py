@@ -1,9 +1,8 @@
-"""Photos taken by a camera that moved: their renders are blurred alike before they are compared.
+"""Motion blur of training photos: their renders are blurred equally before the loss compares them.
 
-Photos that are less sharp than their neighbours are candidates (`core.quality.sharpness`). The movement of their camera
-is estimated from the model's renders (`modules.motion_blur`), a few times as the model gets better. The loss compares
-the render as such a camera would have taken it, so that the model stays sharp where the photo is not. Test photos play
-no part.
+Photos less sharp than their neighbours are candidates (`core.quality.sharpness`). The movement of their camera is
+estimated from the model's renders (`modules.motion_blur`), a few times as the model improves. So the model stays sharp
+where photos are not. Test photos are not used.
 """
 
 import logging
@@ -22,16 +21,15 @@ from gsx.core.ranges import Range, Share
 from gsx.core.training.module import ModuleContext
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.modules.coarser import coarser
 from gsx.modules.corrections import Correction, CorrectionOptions, Times
-from gsx.modules.motion_blur import Movement, movement_between
-from gsx.modules.movement import blurred_to_learn
+from gsx.modules.derived_views import reduce_view
+from gsx.modules.motion_blur import Movement, SharpenedBlur, movement_between
 from gsx.modules.photo_pairs import match_brightness
 
 logger = logging.getLogger(__name__)
 
 MAX_PIXELS = 1 << 18
-"""Movements are estimated from views of at most so many pixels."""
+"""Most pixels of a view from which a movement is estimated."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,14 +44,14 @@ class BlurOptions(CorrectionOptions):
     sharpness: Annotated[float, Range(0, 10)] = 0.9
     """`auto`: photos with less than this share of their neighbours' fine contrast are candidates."""
     length: Annotated[float, Range(0, 100)] = 1.0
-    """Shorter movements, px, blur nothing."""
+    """Shortest movement that blurs renders, px."""
     explained: Share = 0.01
     """Share of the squared difference from the model, at its best gains, that a movement must explain in each half of a
     photo that shows it."""
 
 
 class Blur(Correction):
-    """Movements of the cameras of training photos during their exposure."""
+    """Camera movements during the exposure of training photos."""
 
     options: BlurOptions
     seconds_key = "blur_seconds"
@@ -62,21 +60,21 @@ class Blur(Correction):
     def __init__(self, options: BlurOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
         self.movements: dict[str, tuple[float, float]] = {}
-        """Movement to the right and down, as shares of the frame's sides, by the names of blurred photos."""
+        """Movement to the right and down, shares of the frame's sides, by the name of a blurred photo."""
 
     @property
     def active(self) -> bool:
-        """Whether photos are blurred."""
+        """True if photos are blurred."""
         return bool(self.movements)
 
     def restarted(self, context: ModuleContext) -> "Blur":
-        """Returns a module with the present movements, which estimates none."""
+        """Returns a module with the present movements that estimates no others."""
         module = Blur(BlurOptions(), context)
         module.movements = dict(self.movements)
         return module
 
     def estimate(self, run: Run, step: int) -> dict[str, float]:
-        """Estimate by how much the camera moved in each candidate."""
+        """Estimates the camera's movement in each candidate."""
         candidates = self.candidates(run.train_views)
         lengths = self.move({view: self.estimate_movement(run, view) for view in candidates}, step)
         middle = {"blur_length": median(lengths)} if lengths else {}
@@ -102,15 +100,12 @@ class Blur(Correction):
         photo, mask, image = small.image(), small.counted(), render(run, small.camera, supersample=1).image
         sharp = run.views.without(self).match_photo(image, None, small).detach().cpu()
         movement = movement_between(match_brightness(sharp, photo, mask), photo, mask)
-        return movement.times(view.camera.focal / small.camera.focal)
-
-    def counts(self, movement: Movement) -> bool:
-        """Returns whether an estimated movement blurs a photo."""
-        return movement.length >= self.options.length and movement.explained >= self.options.explained
+        return movement.scaled(view.camera.focal / small.camera.focal)
 
     def move(self, estimates: Mapping[View, Movement], step: int) -> list[float]:
-        """Take the movements, px of their views, that count; returns their lengths, px."""
-        kept = {view: movement for view, movement in estimates.items() if self.counts(movement)}
+        """Keeps the movements, px of their views, that are long and explain enough; returns their lengths, px."""
+        length, explained = self.options.length, self.options.explained
+        kept = {view: m for view, m in estimates.items() if m.length >= length and m.explained >= explained}
         self.movements = {view.name: view.camera.frame.shares(m.across, m.down) for view, m in kept.items()}
         self.last_estimate = step
         return [movement.length for movement in kept.values()]
@@ -118,11 +113,11 @@ class Blur(Correction):
     def transform_render(
         self, image: Tensor, view: View, photo: Tensor | None, window: Window | None, learning: bool
     ) -> Tensor:
-        """Returns the render as the camera of a photo would have taken it, at any size."""
+        """Returns the render blurred as its photo, at any size."""
         if view.name not in self.movements:
             return image
         (across, down), frame = self.movements[view.name], view.camera.frame
-        return blurred_to_learn(image, across * frame.width, down * frame.height)
+        return SharpenedBlur.apply(image, across * frame.width, down * frame.height)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Returns the movements; empty where there are none."""
@@ -134,21 +129,21 @@ class Blur(Correction):
         return {"asked": torch.tensor(self.last_estimate)} | tensors
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on from a checkpoint; empty: no photo is blurred."""
+        """Restores a checkpoint; empty: no photo is blurred."""
         names = [name for name in tensors if name != "asked"]
         self.movements = {name.removeprefix("of "): tuple(tensors[name].tolist()) for name in names}
         self.last_estimate = int(tensors["asked"]) if tensors else 0
 
     @classmethod
     def figures(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """Returns when movements were estimated first, and of how many photos at last."""
+        """Returns the step of the first estimate, the counts of the last, and its median length, px."""
         first, last = lines[0], lines[-1]
         counts = {"step": first["step"], "blurred": last["blurred"], "asked": last["blur_suspects"]}
         return counts | {"length": last.get("blur_length", 0.0)}
 
     @classmethod
     def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
-        """Yields that photos are blurred."""
+        """Reports blurred photos."""
         figures = evaluation.get("blur") or {}
         if figures.get("blurred"):
             yield (
@@ -158,9 +153,9 @@ class Blur(Correction):
 
 
 def reduced_to(view: View, run: Run, pixels: int) -> View:
-    """Returns the view halved until it has at most so many pixels, or cannot be halved."""
+    """Returns the view halved until it has at most `pixels` pixels, or cannot be halved."""
     while view.camera.width * view.camera.height > pixels:
-        halved = coarser(view, run.scene.reduction, 2)
+        halved = reduce_view(view, run.scene.reduction, 2)
         if halved is view:
             break
         view = halved

@@ -11,8 +11,8 @@ from typing import Annotated
 from gsx.core.data.scene import View
 from gsx.core.ranges import Range, Share
 from gsx.core.training.module import ModuleContext, TrainingModule
-from gsx.modules.coarser import coarser
 from gsx.modules.corrections import ViewCache
+from gsx.modules.derived_views import reduce_view
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ class CoarseToFine(TrainingModule):
             return views
         reduction = self.context.scene.reduction
         cache = self.coarse.setdefault(factor, ViewCache())
-        return cache.get(views, lambda: [coarser(view, reduction, factor) for view in views])
+        return cache.get(views, lambda: [reduce_view(view, reduction, factor) for view in views])
 
     def milestones(self) -> list[int]:
         """Returns the last step that sees coarse views."""

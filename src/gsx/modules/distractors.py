@@ -21,7 +21,6 @@ from gsx.core.training.importance import Probe
 from gsx.core.training.module import ModuleContext
 from gsx.core.training.parameter_table import keep_rows
 from gsx.core.training.run import Run
-from gsx.modules.coarser import CoarseSource, coarser
 from gsx.modules.corrections import (
     Correction,
     CorrectionOptions,
@@ -32,6 +31,7 @@ from gsx.modules.corrections import (
     percent,
     sample,
 )
+from gsx.modules.derived_views import CoarseSource, reduce_view
 from gsx.modules.distractor_masks import Difference, difference_of, distractors_in
 from gsx.modules.photo_pairs import REDUCTION, gains, match_brightness, render_reduced
 
@@ -168,7 +168,7 @@ def rows_of_distractors(run: Run, views: Sequence[View]) -> Bool[Tensor, "N"]:
     hidden, total = run.background.new_zeros(2, len(run.backbone.table))
     for view in views:
         run.raise_if_stopping()
-        small = coarser(view, run.scene.reduction, REDUCTION)
+        small = reduce_view(view, run.scene.reduction, REDUCTION)
         masked, everywhere = probe.render(small.camera).blending_weights(small.counted())
         hidden, total = hidden + masked, total + everywhere
     return hidden > total / 2

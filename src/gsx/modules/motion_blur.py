@@ -1,119 +1,199 @@
-"""By how much a camera moved while a photograph was exposed, by a sharp picture beside it (`modules.movement`).
+"""Motion blur of photos: the mean of an image over a line, its gradient, and an estimate of the line.
 
-With R and P the spectra of both and H that of a movement, P is near G H R. G, a gain by the size of the frequency,
-stands for a sharp picture that is not as sharp as it should be: a model that learns from blurred photographs is blurred
-itself, in all directions, and without G movements would be found too short. The best gains of a movement are known;
-several movements are tried, and the one that leaves the least difference is taken. A model that is blurred along one
-line, and photographs that are not, look as if these were moved across it.
+A turn of the camera moves the whole image equally, at any depth, and in a short time about evenly along a line: the
+photo is the mean of the sharp image over that line, the movement.
+
+The estimate compares a photo with a sharp image. With spectra R of the sharp image, P of the photo and H of a movement,
+P is near G H R. The gain G, one per size of frequency, stands for a sharp image that is not sharp enough: a model that
+learns from blurred photos is blurred in all directions, and without G movements would come out too short. The best
+gains of a movement have a closed form; the estimate is the movement with the least difference. A model that is blurred
+along one line, with photos that are not, looks like photos moved across that line.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.autograd import Function
+from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
 from gsx.core.shapes import Bool, Float, Int
-from gsx.modules.movement import line_kernel, motion_blurred
 
+Image: TypeAlias = Float[Tensor, "C H W"]
+Grey: TypeAlias = Float[Tensor, "H W"]
+Spectrum: TypeAlias = Float[Tensor, "h w"]
+"""Half of all frequencies, [rows, columns], as `torch.fft.rfft2` has them."""
+
+SAMPLES = 4
+"""Points on a movement per px."""
+DAMPING = 0.05
+"""Damping of sharpened gradients: suppresses frequencies that blur reduces below the root of it."""
+REACH = 4
+"""Padding of a sharpened gradient, in sizes of the kernel."""
 DIRECTIONS, LENGTHS = 8, (2.0, 5.0, 12.0)
-"""Movements that are tried at first, px."""
-FIRST, FINEST = 1.0, 0.25
-"""The first change that is tried along each axis from the best of them on, at least, and the last, px."""
-MOST = 24.0
+"""Movements that the search starts from: directions, lengths in px."""
+FIRST_STEP, LAST_STEP = 1.0, 0.25
+"""Smallest first step of the descent, and last step, px."""
+LONGEST = 24.0
 """Longest movement along an axis, px."""
 RINGS = 64
-"""Of frequencies by their size, a cycle per px."""
+"""Rings of frequencies by size, per cycle per px."""
 EDGE = 6
-"""Pictures fade out towards their edges, over one in so many of their pixels."""
+"""Images fade out towards their edges over one in this many pixels."""
 MARGIN, ROUNDS = 8, 2
-"""Px around what does not count that say nothing at first; how often it is filled in after that, by the sharp picture
-after the movement that was found so far."""
-SMALLEST = 32
-"""Px of a side; smaller pictures have too few frequencies to tell anything by."""
-SEEN = 0.1
-"""Of how much a movement shows in a picture, the share that it has to show in a half of it, for that to say whether it
-took place: it hardly shows on a plain wall, in the sky, or where little counts."""
+"""Width of the zone around masked pixels that is ignored at first, px; rounds that then fill masked pixels in with the
+sharp image, moved."""
+MIN_SIDE = 32
+"""Smallest side of an image that is searched, px: smaller ones have too few frequencies."""
+VISIBLE = 0.1
+"""Least share of a movement's effect that a half of the image must have to count: plain walls, sky and masked parts
+hardly change."""
+
+
+# -- blur --------------------------------------------------------------------------------------------------------------
+
+
+def line_kernel(across: float, down: float) -> Float[Tensor, "K K"]:
+    """Returns the weights of the mean over a movement, centred, float64: points on it, each bilinear in four pixels."""
+    count = max(1, math.ceil(SAMPLES * math.hypot(across, down)))
+    along = (torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5
+    radius = math.ceil(max(abs(across), abs(down)) / 2)
+    places = torch.stack([down * along, across * along], 1) + radius
+    first = places.floor()
+    (up, left), (low, right) = (part.unbind(1) for part in (1 - (places - first), places - first))
+    kernel = torch.zeros(2 * radius + 2, 2 * radius + 2, dtype=torch.float64)
+    row, column = first.long().unbind(1)
+    for rows, of_row in ((0, up), (1, low)):
+        for columns, of_column in ((0, left), (1, right)):
+            kernel.index_put_((row + rows, column + columns), of_row * of_column / count, accumulate=True)
+    return kernel[: 2 * radius + 1, : 2 * radius + 1]
+
+
+def motion_blurred(image: Image, across: float, down: float) -> Image:
+    """Returns the mean of an image over a movement, px; edge pixels continue beyond its edges."""
+    kernel = line_kernel(across, down)
+    side, (height, width) = len(kernel) // 2, image.shape[1:]
+    if side == 0:
+        return image
+    around, total = pad(image[None], (side, side, side, side), mode="replicate")[0], torch.zeros_like(image)
+    for row, column in kernel.nonzero().tolist():
+        weight = float(kernel[row, column])
+        total = torch.add(total, around[:, row : row + height, column : column + width], alpha=weight)
+    return total
+
+
+class SharpenedBlur(Function):
+    """`motion_blurred` with the gradient of `sharpened`.
+
+    With K the mean over the movement, the slope of a loss with gradient g is K^T g: blur weights details down twice,
+    and they are learnt last. The gradient here is (1 + d) (K^T K + d)^-1 K^T g, the Gauss-Newton direction for the
+    sharp image, damped by d (Levenberg 1944). Away from the edges it descends, too; without blur it is the slope; it is
+    at most (1 + d) / (2 sqrt d) times as large as g.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, image: Image, across: float, down: float) -> Image:
+        ctx.movement = across, down
+        return motion_blurred(image, across, down)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Image) -> tuple[Image, None, None]:
+        return sharpened(gradient, *ctx.movement), None, None
+
+
+def sharpened(gradient: Image, across: float, down: float) -> Image:
+    """Returns (1 + d) (K^T K + d)^-1 K^T of a gradient, by its spectrum; zero beyond its edges."""
+    kernel, (height, width) = line_kernel(across, down).to(gradient), gradient.shape[1:]
+    side, beyond = len(kernel) // 2, REACH * len(kernel)
+    size = height + beyond, width + beyond
+    around = pad(kernel, (0, size[1] - len(kernel), 0, size[0] - len(kernel))).roll((-side, -side), (0, 1))
+    share = torch.fft.rfft2(around).real  # transfer function; real, since movements have no direction
+    factor = (1 + DAMPING) * share / (share.square() + DAMPING)
+    return torch.fft.irfft2(factor * torch.fft.rfft2(gradient, s=size), s=size)[:, :height, :width].contiguous()
+
+
+# -- estimate ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Movement:
-    """Of a camera during an exposure, and how well it explains the photograph."""
+    """A camera's movement during an exposure, and how well it explains the photo."""
 
     across: float
-    """Px to the right."""
+    """To the right, px."""
     down: float
-    """Px; both with the other sign are the same movement."""
+    """Px; both negated are the same movement."""
     explained: float
-    """Share of the squared difference between photograph and sharp picture at its best gains that is gone after it, in
-    the half of the picture where it is least: a camera moves all of it. 0 where none is."""
+    """Share of the squared difference between photo and sharp image, at best gains, that the movement removes, in the
+    half of the image with the smaller share: a camera moves both. 0: no movement."""
 
     @property
     def length(self) -> float:
-        """Px."""
+        """Length, px."""
         return math.hypot(self.across, self.down)
 
-    def times(self, factor: float) -> "Movement":
-        """In px so many times as small."""
+    def scaled(self, factor: float) -> "Movement":
+        """Returns the movement times a factor."""
         return Movement(self.across * factor, self.down * factor, self.explained)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Spectra:
-    """Of a sharp picture R and a photograph P, [rows, columns] of half of all frequencies."""
+    """Spectra of a sharp image R and a photo P."""
 
     across: Float[Tensor, "w"]
     """Frequencies along rows, cycles per px."""
     down: Float[Tensor, "h"]
-    """Along columns."""
+    """Frequencies along columns, cycles per px."""
     ring: Int[Tensor, "h w"]
-    """By the frequency's size."""
-    sharp: Float[Tensor, "h w"]
-    """|R|^2, once for each frequency that it stands for; 0 of those above half a cycle per px."""
-    shared: Float[Tensor, "h w"]
+    """Ring of each frequency."""
+    sharp: Spectrum
+    """|R|^2 times the number of frequencies that each stands for; 0 above half a cycle per px."""
+    shared: Spectrum
     """Re P R*, likewise."""
-    photograph: float
-    """|P|^2, likewise, summed."""
+    photo: float
+    """Sum of |P|^2, likewise."""
 
 
 def movement_between(
-    sharp: Float[Tensor, "3 H W"], photograph: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None = None
+    sharp: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"], mask: Bool[Tensor, "H W"] | None = None
 ) -> Movement:
-    """The movement by which a sharp picture comes nearest to a photograph of the same exposure, over pixels that count;
-    its gains by the size of the frequency are free. None where pictures are small."""
-    if min(sharp.shape[1:]) < SMALLEST:
+    """Estimates the movement from a sharp image to a photo of equal exposure, over pixels that count.
+
+    Returns no movement for small images.
+    """
+    if min(sharp.shape[1:]) < MIN_SIDE:
         return Movement(0.0, 0.0, explained=0.0)
-    shown, taken, weight = sharp.mean(0), photograph.mean(0), None if counted is None else well_within(counted)
-    telling = spectra_of(shown, taken, weight)
-    found = descended(nearest([(0.0, 0.0), *fan()], telling), telling)
-    if counted is not None:
+    source, target, weight = sharp.mean(0), photo.mean(0), None if mask is None else interior_weights(mask)
+    spectra = spectra_of(source, target, weight)
+    movement = descend(best([(0.0, 0.0), *first_movements()], spectra), spectra)
+    if mask is not None:
         for _ in range(ROUNDS):
-            filled = torch.where(counted, taken, motion_blurred(shown[None], *found)[0])
-            found = descended(found, spectra_of(shown, filled, None))
-    parts = [telling] if max(shown.shape) < 2 * SMALLEST else spectra_of_halves(shown, taken, weight)
-    return Movement(*found, explained=explained_throughout(found, parts))
+            filled = torch.where(mask, target, motion_blurred(source[None], *movement)[0])
+            movement = descend(movement, spectra_of(source, filled, None))
+    parts = [spectra] if max(source.shape) < 2 * MIN_SIDE else spectra_of_halves(source, target, weight)
+    return Movement(*movement, explained=least_explained(movement, parts))
 
 
-def explained_throughout(movement: tuple[float, float], parts: Sequence[Spectra]) -> float:
-    """Share of the squared difference that is gone after a movement, px, in that of the parts of a picture where it is
-    least, of those that it could be seen in; 0 where there is no less."""
-    shown = [shown_by(movement, part) for part in parts]
-    shares = [explained_by(movement, p) for p, share in zip(parts, shown, strict=True) if share > SEEN * sum(shown)]
+def least_explained(movement: tuple[float, float], parts: Sequence[Spectra]) -> float:
+    """Returns the smallest explained share of the parts in which a movement, px, is visible; at least 0."""
+    effects = [effect(movement, part) for part in parts]
+    shares = [explained(movement, p) for p, size in zip(parts, effects, strict=True) if size > VISIBLE * sum(effects)]
     return max(0.0, min(shares, default=0.0))
 
 
-def shown_by(movement: tuple[float, float], spectra: Spectra) -> float:
-    """By how much a movement, px, shows: squared difference between the sharp picture after it and that at its best
-    gains."""
-    left = left_by(movement, spectra)
-    photograph = float((spectra.sharp * left.square()).sum())
-    return error_after((0.0, 0.0), replace(spectra, shared=spectra.sharp * left, photograph=photograph))
+def effect(movement: tuple[float, float], spectra: Spectra) -> float:
+    """Returns the squared difference between the sharp image after a movement, px, and before it, at best gains."""
+    factor = kernel_spectrum(movement, spectra)
+    photo = float((spectra.sharp * factor.square()).sum())
+    return error_after((0.0, 0.0), replace(spectra, shared=spectra.sharp * factor, photo=photo))
 
 
-def explained_by(movement: tuple[float, float], spectra: Spectra) -> float:
-    """Share of the squared difference that is gone after a movement, px; negative where there is more."""
+def explained(movement: tuple[float, float], spectra: Spectra) -> float:
+    """Returns the share of the squared difference that a movement, px, removes; negative where it adds."""
     still = error_after((0.0, 0.0), spectra)
     return 1 - error_after(movement, spectra) / still if still > 0 else 0.0
 
@@ -121,14 +201,12 @@ def explained_by(movement: tuple[float, float], spectra: Spectra) -> float:
 # -- spectra -----------------------------------------------------------------------------------------------------------
 
 
-def spectra_of(
-    sharp: Float[Tensor, "H W"], photograph: Float[Tensor, "H W"], weight: Float[Tensor, "H W"] | None
-) -> Spectra:
-    """Of two pictures less their means, by a weight of their pixels; float64."""
+def spectra_of(sharp: Grey, photo: Grey, weight: Grey | None) -> Spectra:
+    """Returns the spectra of two images less their means, with weights of their pixels; float64."""
     height, width = sharp.shape
-    window = fading(height)[:, None] * fading(width)
+    window = tukey_window(height)[:, None] * tukey_window(width)
     window = window if weight is None else window * weight
-    r, p = (spectrum(values.double(), window) for values in (sharp, photograph))
+    r, p = (windowed_spectrum(values.double(), window) for values in (sharp, photo))
     across, down = torch.fft.rfftfreq(width, dtype=torch.float64), torch.fft.fftfreq(height, dtype=torch.float64)
     size = torch.hypot(across, down[:, None])
     times = torch.where((across == 0) | (across == 0.5), 1, 2) * (size <= 0.5)  # rfft leaves out the other half
@@ -138,45 +216,42 @@ def spectra_of(
         ring=(RINGS * size).round().long(),
         sharp=times * (r * r.conj()).real,
         shared=times * (p * r.conj()).real,
-        photograph=float((times * (p * p.conj()).real).sum()),
+        photo=float((times * (p * p.conj()).real).sum()),
     )
 
 
-def spectra_of_halves(
-    sharp: Float[Tensor, "H W"], photograph: Float[Tensor, "H W"], weight: Float[Tensor, "H W"] | None
-) -> list[Spectra]:
-    """Of the halves of two pictures along their longer sides."""
+def spectra_of_halves(sharp: Grey, photo: Grey, weight: Grey | None) -> list[Spectra]:
+    """Returns the spectra of the halves of two images along their longer sides."""
     axis = int(sharp.shape[1] >= sharp.shape[0])
     weights = [None, None] if weight is None else list(weight.tensor_split(2, axis))
-    halves = zip(sharp.tensor_split(2, axis), photograph.tensor_split(2, axis), weights, strict=True)
-    return [spectra_of(shown, taken, part) for shown, taken, part in halves]
+    halves = zip(sharp.tensor_split(2, axis), photo.tensor_split(2, axis), weights, strict=True)
+    return [spectra_of(*half) for half in halves]
 
 
-def well_within(counted: Bool[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-    """Weights of pixels that fade out a margin before what does not count: an edge there would look as sharp in both
-    pictures, and speak against every movement."""
-    weight, side = counted[None].double(), MARGIN + 1
+def interior_weights(mask: Bool[Tensor, "H W"]) -> Grey:
+    """Returns weights that fade out before masked pixels: an edge there is sharp in both images and hides movements."""
+    weight, side = mask[None].double(), MARGIN + 1
     weight = -max_pool2d(-weight, 2 * MARGIN + 1, 1, MARGIN)
     for _ in range(2):
         weight = avg_pool2d(weight, side, 1, side // 2)
     return weight[0]
 
 
-def fading(count: int) -> Float[Tensor, "count"]:
-    """One, down to zero at both ends (Tukey's window), float64."""
+def tukey_window(count: int) -> Float[Tensor, "count"]:
+    """Returns 1, falling to 0 at both ends, float64."""
     end = max(1, count // EDGE)
     rise = 0.5 - 0.5 * torch.cos(math.pi * (torch.arange(end, dtype=torch.float64) + 0.5) / end)
     return torch.cat([rise, torch.ones(count - 2 * end, dtype=torch.float64), rise.flip(0)])
 
 
-def spectrum(values: Float[Tensor, "H W"], window: Float[Tensor, "H W"]) -> Tensor:
-    """Of values less their mean in a window, in it; complex."""
+def windowed_spectrum(values: Grey, window: Grey) -> Tensor:
+    """Returns the complex spectrum of values less their mean in a window, times the window."""
     mean = (values * window).sum() / window.sum().clamp_min(1e-12)
     return torch.fft.rfft2((values - mean) * window)
 
 
-def left_by(movement: tuple[float, float], spectra: Spectra) -> Float[Tensor, "h w"]:
-    """What the mean over a movement leaves of each frequency: its kernel's spectrum, real, as it has no direction."""
+def kernel_spectrum(movement: tuple[float, float], spectra: Spectra) -> Spectrum:
+    """Returns the transfer function of the mean over a movement; real, as it has no direction."""
     kernel = line_kernel(*movement)
     offsets = 2 * math.pi * (torch.arange(len(kernel), dtype=torch.float64) - len(kernel) // 2)
     x, y = (along[:, None] * offsets for along in (spectra.across, spectra.down))
@@ -184,40 +259,40 @@ def left_by(movement: tuple[float, float], spectra: Spectra) -> Float[Tensor, "h
 
 
 def error_after(movement: tuple[float, float], spectra: Spectra) -> float:
-    """Squared difference that a movement, px, leaves, with the best gain of each ring."""
-    left = left_by(movement, spectra)
+    """Returns the squared difference after a movement, px, at the best gain of each ring."""
+    factor = kernel_spectrum(movement, spectra)
     ring = spectra.ring.flatten()
-    shared = torch.bincount(ring, (spectra.shared * left).flatten())
-    sharp = torch.bincount(ring, (spectra.sharp * left.square()).flatten())
-    explained = shared.clamp_min(0).square() / sharp.clamp_min(torch.finfo(sharp.dtype).tiny)
-    return max(0.0, spectra.photograph - float(explained.sum()))
+    shared = torch.bincount(ring, (spectra.shared * factor).flatten())
+    sharp = torch.bincount(ring, (spectra.sharp * factor.square()).flatten())
+    removed = shared.clamp_min(0).square() / sharp.clamp_min(torch.finfo(sharp.dtype).tiny)
+    return max(0.0, spectra.photo - float(removed.sum()))
 
 
-# -- movements ---------------------------------------------------------------------------------------------------------
+# -- search ------------------------------------------------------------------------------------------------------------
 
 
-def nearest(movements: Sequence[tuple[float, float]], spectra: Spectra) -> tuple[float, float]:
-    """The first of the movements after which the difference is least."""
+def best(movements: Sequence[tuple[float, float]], spectra: Spectra) -> tuple[float, float]:
+    """Returns the first of the movements with the least difference."""
     return min(movements, key=lambda movement: error_after(movement, spectra))
 
 
-def descended(start: tuple[float, float], spectra: Spectra) -> tuple[float, float]:
-    """From one movement to ever better ones beside it, by ever smaller steps."""
-    where, step = start, max(FIRST, math.hypot(*start) / 4)
-    while step >= FINEST:
-        better = nearest([where, *around(where, step)], spectra)
+def descend(start: tuple[float, float], spectra: Spectra) -> tuple[float, float]:
+    """Descends from a movement by ever smaller steps."""
+    where, step = start, max(FIRST_STEP, math.hypot(*start) / 4)
+    while step >= LAST_STEP:
+        better = best([where, *neighbours(where, step)], spectra)
         step = step / 2 if better == where else step
         where = better
     return where
 
 
-def fan() -> list[tuple[float, float]]:
-    """Movements in all directions."""
+def first_movements() -> list[tuple[float, float]]:
+    """Returns movements of LENGTHS in DIRECTIONS."""
     turns = [math.pi * turn / DIRECTIONS for turn in range(DIRECTIONS)]
     return [(length * math.cos(turn), length * math.sin(turn)) for length in LENGTHS for turn in turns]
 
 
-def around(where: tuple[float, float], step: float) -> list[tuple[float, float]]:
-    """Movements beside one, none longer than MOST along an axis."""
-    beside = [(where[0] + x * step, where[1] + y * step) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]
-    return [there for there in beside if max(map(abs, there)) <= MOST]
+def neighbours(where: tuple[float, float], step: float) -> list[tuple[float, float]]:
+    """Returns the movements one step around another, up to LONGEST along an axis."""
+    moves = [(where[0] + x * step, where[1] + y * step) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]
+    return [move for move in moves if max(map(abs, move)) <= LONGEST]

@@ -11,7 +11,7 @@ from gsx.core.rasterizer import TiledRendering
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.modules.coarser import coarser
+from gsx.modules.derived_views import reduce_view
 
 Pair: TypeAlias = tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"], Bool[Tensor, "H W"] | None]
 """Render, photo, mask of the pixels that count (None: all)."""
@@ -27,7 +27,7 @@ def render_reduced(run: Run, view: View, depth: bool = True, min_pixels: int = 0
     """Returns a reduced view and its render; the view as it is where the reduced one had fewer pixels."""
     run.raise_if_stopping()
     pixels = view.camera.width * view.camera.height / REDUCTION**2
-    small = coarser(view, run.scene.reduction, REDUCTION) if pixels >= min_pixels else view
+    small = reduce_view(view, run.scene.reduction, REDUCTION) if pixels >= min_pixels else view
     return small, render(run, small.camera, supersample=1, depth=depth)
 
 

@@ -1,10 +1,9 @@
-"""Poses of training photos, corrected with the model where they are found to be wrong.
+"""Poses of training photos, corrected with the model if they are wrong.
 
-Structure from motion, or whoever wrote the poses down, may be off by a pixel: then photos pull the model apart, and it
-becomes blurred. One test decides whether they are: the spread of shifts between photos and renders
-that the left and right halves of photos share (`modules.shifts`). If so, each pose moves to where the model says that
-its photo was taken (`modules.alignment`), a few times, while the model goes on learning from better poses. What all
-motions have in common moves the world and no photo: it is taken out again. Test photos play no part.
+Poses that are off by a pixel blur the model. A test measures the spread of shifts between photos and renders that the
+left and right halves of photos share (`modules.image_shift`). Above a threshold each pose moves to its estimate from
+the model (`modules.alignment`), a few times, while the model learns from better poses. The common motion of all
+cameras, which only moves the world, is removed. Test photos are not used.
 """
 
 import logging
@@ -25,23 +24,22 @@ from gsx.core.training.module import ModuleContext
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.formats.turned import cross_matrix
-from gsx.modules.alignment import Motion, aligned, motion_to, rotation_by, usual_depth
-from gsx.modules.coarser import coarser
+from gsx.modules.alignment import Motion, estimate_camera, median_depth, motion_to, rotation_by
 from gsx.modules.corrections import Correction, CorrectionOptions, Times, ViewCache, ViewCount, log_test, sample
+from gsx.modules.derived_views import change_pose, reduce_view
+from gsx.modules.image_shift import estimate_shift
 from gsx.modules.photo_pairs import REDUCTION, render_reduced, shared_spread
-from gsx.modules.pinned import posed
-from gsx.modules.shifts import shift_of
 
 logger = logging.getLogger(__name__)
 
 CORRELATED_PIXELS = 250
-"""Pixels of a photo, about 16 x 16, that share the errors of the model: together they say as much as one."""
+"""Pixels of a photo, about 16 x 16, that share the model's errors: together they weigh as much as one."""
 MIN_ERROR = 0.5
 """Smallest expected error of a pose, px of a photo (standard deviation)."""
 MEDIAN_SQUARE = 0.4549
 """Median of the square of a standard normal variable."""
 MIN_PIXELS = 1 << 13
-"""Poses are estimated from views of at least so many pixels: small photos are not reduced."""
+"""Fewest pixels of a view from which a pose is estimated: small photos are not reduced."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +48,7 @@ class PoseOptions(CorrectionOptions):
 
     key: ClassVar[str] = "poses"
     times: Times = 7
-    """Number of corrections, at shares that grow by the same factor: a model that knows little gives way soonest."""
+    """Number of corrections, at shares that grow by the same factor: an early model adapts soonest."""
     spread: Annotated[float, Range(0, 100)] = 0.12
     """`auto`: standard deviation of shifts along an axis, px, above which poses are corrected."""
     views: ViewCount = 24
@@ -68,14 +66,14 @@ class Poses(Correction):
     def __init__(self, options: PoseOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
         self.matrices: Float[Tensor, "N 3 4"] | None = None
-        """camera_from_world, rotation and translation; None: those of the scene."""
+        """camera_from_world, rotation and translation; None: the scene's."""
         self.error = math.nan
-        """Error of the scene's poses that the last correction expected, px, standard deviation."""
+        """Expected error of the scene's poses at the last correction, px, standard deviation."""
         self.cache = ViewCache()
 
     @property
     def active(self) -> bool:
-        """Whether poses are corrected."""
+        """True if poses are corrected."""
         return self.matrices is not None
 
     def transform_views(self, views: Sequence[View], step: int | None) -> Sequence[View]:
@@ -83,16 +81,18 @@ class Poses(Correction):
         if self.matrices is None:
             return views
         pairs = zip(views, self.matrices, strict=True)
-        return self.cache.get(views, lambda: [posed(view, with_pose(view.camera, matrix)) for view, matrix in pairs])
+        return self.cache.get(
+            views, lambda: [change_pose(view, with_pose(view.camera, matrix)) for view, matrix in pairs]
+        )
 
     # -- estimates -----------------------------------------------------------------------------------------------------
 
     def estimate(self, run: Run, step: int) -> dict[str, float]:
-        """Test whether poses are wrong, where that is due first, and correct them if so."""
+        """Tests poses, at first, and corrects them if they are wrong."""
         views, usual, metrics = run.train_views, math.nan, dict[str, float]()
         if not self.active:
             halves = half_shifts(photo_pairs(run, sample(views, self.options.views, "poses")))
-            metrics["pose_spread"], usual = shift_spread(halves), usual_shift(halves)
+            metrics["pose_spread"], usual = shared_spread(*halves.unbind(1)), usual_shift(halves)
             if not self.wrong(metrics["pose_spread"], step):
                 return metrics | {"poses": 0}
         metrics["poses"], metrics["pose_motion"] = len(views), self.align(run, views, usual, step)
@@ -100,35 +100,32 @@ class Poses(Correction):
         return metrics
 
     def wrong(self, spread: float, step: int) -> bool:
-        """Returns whether poses need correction, by the spread of shifts, px; logs it."""
+        """Compares the spread of shifts, px, with the threshold and logs it; returns True if poses need correction."""
         wrong = spread > self.options.spread or self.options.when == "always"
         verdict = "refining poses" if wrong else "poses kept"
         log_test(step, "pose error", spread, self.options.spread, "{:.2f} px".format, verdict)
         return wrong
 
     def align(self, run: Run, views: Sequence[View], usual: float, step: int) -> float:
-        """Move each photo to where the model says that it was taken; returns the RMS motion, px.
-
-        usual: the usual shift between photos and renders, px; nan: unknown.
-        """
+        """Moves each pose to its estimate; returns the RMS motion, px. usual: shift of photos, px; nan: unknown."""
         after, depths, error = list[Camera](), list[float](), self.expected_error(step, usual)
-        held = CORRELATED_PIXELS / error**2
+        weight = CORRELATED_PIXELS / error**2
         for view, scene_view in zip(views, self.context.scene.train, strict=True):
             small, rendering = render_reduced(run, view, min_pixels=MIN_PIXELS)
             assert rendering.depth is not None
             pictures = rendering.image, rendering.depth, rendering.alpha, small.image(), small.counted()
-            after.append(aligned(small.camera, *pictures, given=scene_view.camera, held=held))
-            depths.append(usual_depth(rendering.depth, rendering.alpha))
+            after.append(estimate_camera(small.camera, *pictures, prior=scene_view.camera, prior_weight=weight))
+            depths.append(median_depth(rendering.depth, rendering.alpha))
         known = [depth for depth in depths if math.isfinite(depth)]
         depth = median(known) if known else run.scene.extent
         return self.correct([view.camera for view in views], after, depth, step, error)
 
     def expected_error(self, step: int, usual: float) -> float:
-        """Returns the error of the scene's poses that the prior of a correction expects, px.
+        """Returns the error of the scene's poses that the prior of a correction assumes, px.
 
-        It is the usual shift at the first correction and shrinks by the same factor to MIN_ERROR at the last one. Held
-        loosely, photos that are far off come near; held firmly, the small errors of each correction do not add up. A
-        run that goes on longer holds them no less.
+        The usual shift at the first correction, shrinking by the same factor to MIN_ERROR at the last. A weak prior
+        lets poses that are far off move; a strong one keeps small errors of corrections from adding up. A run that
+        resumes with more steps does not weaken it.
         """
         if self.matrices is None:
             return max(MIN_ERROR, usual)  # which may be nan
@@ -139,9 +136,9 @@ class Poses(Correction):
     def correct(
         self, before: Sequence[Camera], after: Sequence[Camera], depth: float, step: int, error: float
     ) -> float:
-        """Move each pose from one camera to another, less the common motion; returns the RMS motion, px.
+        """Moves each pose from one camera to another, less the common motion; returns the RMS motion, px.
 
-        depth: scene units, at which moves are weighed against turns. error: what the prior expected, px.
+        depth: scene units, converts moves to px. error: expected by the prior, px.
         """
         after = without_common(before, after, depth)
         self.take(torch.stack([torch.cat([c.rotation, c.translation[:, None]], 1).double() for c in after]))
@@ -150,7 +147,7 @@ class Poses(Correction):
         return math.sqrt(float(motions.square().sum(1).mean()))
 
     def take(self, matrices: Float[Tensor, "N 3 4"] | None) -> None:
-        """Use these poses from now on."""
+        """Uses these poses from now on."""
         self.matrices, self.cache = matrices, ViewCache()
 
     # -- files ---------------------------------------------------------------------------------------------------------
@@ -163,21 +160,21 @@ class Poses(Correction):
         return {"matrices": self.matrices, "corrected": torch.tensor(self.last_estimate), "error": error}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on from a checkpoint; empty: poses are the scene's."""
+        """Restores a checkpoint; empty: poses are the scene's."""
         self.take(tensors["matrices"].clone() if tensors else None)
         self.last_estimate = int(tensors["corrected"]) if tensors else 0
         self.error = float(tensors.get("error", math.nan))  # older checkpoints lack it
 
     @classmethod
     def figures(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """Returns when poses were tested, the spread of shifts, how many are corrected, and the motions."""
+        """Returns the step of the test, the spread of shifts, the number of corrected poses, and the motions."""
         first, motions = lines[0], [line["pose_motion"] for line in lines if "pose_motion" in line]
         tested = {"step": first["step"], "spread": first.get("pose_spread"), "corrected": first["poses"]}
         return tested | {"motions": motions}
 
     @classmethod
     def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
-        """Yields that training poses are corrected, and test poses are not."""
+        """Reports corrected training poses; test poses are not corrected."""
         figures = evaluation.get("poses") or {}
         if figures.get("corrected"):
             error = "off" if figures["spread"] is None else f"off by {figures['spread']:.2f} px"
@@ -191,7 +188,7 @@ def photo_pairs(run: Run, views: Sequence[View]) -> Iterator[tuple[Tensor, Tenso
     """Yields (render, photo, pixels that count, px of the photo per pixel) of reduced views."""
     for view in views:
         run.raise_if_stopping()
-        small = coarser(view, run.scene.reduction, REDUCTION)
+        small = reduce_view(view, run.scene.reduction, REDUCTION)
         image = render(run, small.camera).image
         yield image, small.image(), small.counted(), view.camera.focal / small.camera.focal
 
@@ -202,18 +199,13 @@ def photo_pairs(run: Run, views: Sequence[View]) -> Iterator[tuple[Tensor, Tenso
 def half_shifts(
     pairs: Iterable[tuple[Tensor, Tensor, Bool[Tensor, "H W"] | None, float]],
 ) -> Float[Tensor, "N 2 2"]:
-    """Returns shifts of both halves of each photo from its render, to the right and down, px; nan: unknown."""
+    """Returns the shifts of both halves of each photo from its render, to the right and down, px; nan: unknown."""
     shifts = [[half_shift(*pair, right) for right in (False, True)] for pair in pairs]
     return torch.tensor(shifts, dtype=torch.float64)
 
 
-def shift_spread(halves: Float[Tensor, "N 2 2"]) -> float:
-    """Returns the spread of shifts that both halves share, px, standard deviation along an axis; 0: too few known."""
-    return shared_spread(halves[:, 0], halves[:, 1])
-
-
 def usual_shift(halves: Float[Tensor, "N 2 2"]) -> float:
-    """Returns the spread by the median over photos and axes, which a few that are far off hardly change; px."""
+    """Returns the spread of shifts by the median over photos and axes, robust to outliers; px."""
     known = halves[halves.isfinite().all(2).all(1)]
     if not len(known):
         return 0.0
@@ -231,7 +223,7 @@ def half_shift(
     """Returns the shift to the right and down of half a photo from half its render; px: of the photo per pixel."""
     middle = image.shape[2] // 2
     part = slice(middle, None) if right else slice(middle)
-    shift = shift_of(image[..., part], photo[..., part], None if mask is None else mask[..., part])
+    shift = estimate_shift(image[..., part], photo[..., part], None if mask is None else mask[..., part])
     return (math.nan, math.nan) if shift is None else (px * shift[0], px * shift[1])
 
 
@@ -245,7 +237,7 @@ def with_pose(camera: Camera, matrix: Float[Tensor, "3 4"]) -> Camera:
 
 
 def px_per_unit(camera: Camera, depth: float) -> Float[Tensor, "6"]:
-    """Returns how far what lies at a depth moves on the screen per rad and per scene unit, px."""
+    """Returns the motion on the screen of points at a depth, px per rad and per scene unit."""
     return camera.focal * torch.tensor([1.0] * 3 + [1 / depth] * 3, dtype=torch.float64)
 
 
@@ -255,14 +247,14 @@ def motion_px(before: Camera, after: Camera, depth: float) -> Float[Tensor, "6"]
 
 
 def adjoint(camera: Camera) -> Float[Tensor, "6 6"]:
-    """Returns how a camera's frame moves with the world: the adjoint of its pose."""
+    """Returns the motion of a camera's frame with the world: the adjoint of its pose."""
     rotation, across = camera.rotation.double(), cross_matrix(camera.translation.double())
     upper = torch.cat([rotation, torch.zeros_like(rotation)], 1)
     return torch.cat([upper, torch.cat([across @ rotation, rotation], 1)])
 
 
 def without_common(before: Sequence[Camera], after: Sequence[Camera], depth: float) -> list[Camera]:
-    """Returns cameras after their motions, the world moved back by their common motion: least squares in px."""
+    """Returns cameras after their motions less the common one, by least squares in px."""
     pairs = list(zip(before, after, strict=True))
     columns = torch.cat([px_per_unit(b, depth)[:, None] * adjoint(b) for b, _ in pairs])
     motions = torch.cat([motion_px(b, a, depth) for b, a in pairs])
@@ -273,7 +265,7 @@ def without_common(before: Sequence[Camera], after: Sequence[Camera], depth: flo
 
 
 def in_moved_world(camera: Camera, motion: Motion) -> Camera:
-    """Returns the camera that sees a moved world as the camera sees it: its pose after the motion."""
+    """Returns the camera with the same view of a moved world."""
     rotation, translation = camera.rotation.double(), camera.translation.double()
     return replace(
         camera,

@@ -23,7 +23,7 @@ from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
 from gsx.modules.coarse_to_fine import CoarseToFine, CoarseToFineOptions
-from gsx.modules.coarser import coarser
+from gsx.modules.derived_views import reduce_view
 
 
 class Noise:
@@ -59,7 +59,7 @@ def test_halved_in_equal_times() -> None:
 
 def test_a_coarser_view_shows_the_same_with_every_pixel_a_mean_of_a_block() -> None:
     view = noisy()
-    half = coarser(view, Reduction(), 2)
+    half = reduce_view(view, Reduction(), 2)
     assert half.camera.size == (65, 49)
     fine = view.image().double()[:, :98, :130]
     blocks = (fine[:, ::2, ::2] + fine[:, 1::2, ::2] + fine[:, ::2, 1::2] + fine[:, 1::2, 1::2]) / 4
@@ -75,8 +75,8 @@ def test_a_coarser_view_shows_the_same_with_every_pixel_a_mean_of_a_block() -> N
 
 def test_views_that_would_become_too_small_stay_as_they_are() -> None:
     view = noisy(width=131, height=63)
-    assert coarser(view, Reduction(), 2) is view
-    assert coarser(noisy(height=64), Reduction(), 2) is not None
+    assert reduce_view(view, Reduction(), 2) is view
+    assert reduce_view(noisy(height=64), Reduction(), 2) is not None
 
 
 def test_windows_that_are_judged_by_lie_at_the_same_place_of_coarser_views() -> None:

@@ -23,8 +23,8 @@ from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.photo_check import different, findings_of, summary_lines
-from gsx.modules.alignment import Motion, moved, rotation_by
-from gsx.modules.shifts import shift_of
+from gsx.modules.alignment import Motion, move_camera, rotation_by
+from gsx.modules.image_shift import estimate_shift
 
 PIXELS = 1 << 20
 
@@ -39,7 +39,7 @@ def waves(across: float = 0.0, down: float = 0.0) -> Tensor:
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (1.3, -0.7), (-2.5, 0.4)])
 def test_a_shift_is_found_whatever_the_exposure(shift: tuple[float, float]) -> None:
     """To the accuracy of the interpolation between pixels."""
-    found = shift_of(waves(), 0.6 * waves(*shift) + 0.05, None)
+    found = estimate_shift(waves(), 0.6 * waves(*shift) + 0.05, None)
     assert found == pytest.approx(shift, abs=0.06)
 
 
@@ -51,16 +51,16 @@ def slow(across: float, down: float) -> Tensor:
 
 
 def test_a_large_shift_is_found_coarse_to_fine() -> None:
-    assert shift_of(slow(0, 0), slow(9, -7), None) == pytest.approx((9, -7), abs=0.1)
+    assert estimate_shift(slow(0, 0), slow(9, -7), None) == pytest.approx((9, -7), abs=0.1)
 
 
 def test_a_shift_is_told_by_what_counts_and_hardly_by_what_stands_before_it() -> None:
     photograph, counted = waves(1.0, 0.5), torch.ones(60, 80, dtype=torch.bool)
     photograph[:, 20:32, 30:44] = 1.0
-    assert shift_of(waves(), photograph, None) == pytest.approx((1.0, 0.5), abs=0.15)
+    assert estimate_shift(waves(), photograph, None) == pytest.approx((1.0, 0.5), abs=0.15)
     photograph[:, :, :40] = waves(-2.0, -2.0)[:, :, :40]
     counted[:, :45] = False
-    assert shift_of(waves(), photograph, counted) == pytest.approx((1.0, 0.5), abs=0.03)
+    assert estimate_shift(waves(), photograph, counted) == pytest.approx((1.0, 0.5), abs=0.03)
 
 
 def test_what_is_plain_around_a_thing_does_not_hold_it() -> None:
@@ -74,20 +74,20 @@ def test_what_is_plain_around_a_thing_does_not_hold_it() -> None:
     generator = torch.Generator().manual_seed(0)
     learnt = avg_pool2d(thing()[None], 5, 1, 2, count_include_pad=False)[0]
     noise = 0.04 * torch.randn(learnt.shape, generator=generator) * (learnt.amin(0) < 0.95)
-    assert shift_of(learnt + noise, thing(0.6, -0.4), None) == pytest.approx((0.6, -0.4), abs=0.1)
+    assert estimate_shift(learnt + noise, thing(0.6, -0.4), None) == pytest.approx((0.6, -0.4), abs=0.1)
 
 
 def test_a_spot_in_a_faint_picture_does_not_stand_for_all_of_it() -> None:
     """It alone has slopes to speak of, and stands still."""
     faint, moved = (0.5 + 0.05 * (picture - 0.5) for picture in (waves(), waves(1.3, -0.7)))
     faint[:, 30:33, 40:43] = moved[:, 30:33, 40:43] = 0.9
-    assert shift_of(faint, moved, None) == pytest.approx((1.3, -0.7), abs=0.1)
+    assert estimate_shift(faint, moved, None) == pytest.approx((1.3, -0.7), abs=0.1)
 
 
 def test_a_plain_picture_a_stripe_and_a_small_one_tell_no_shift() -> None:
     stripes = (0.4 * torch.arange(80.0)).sin().expand(3, 60, 80) / 2 + 0.5
     for picture in (torch.full((3, 60, 80), 0.5), stripes, waves()[:, :9, :9]):
-        assert shift_of(picture, picture, None) is None
+        assert estimate_shift(picture, picture, None) is None
 
 
 def test_gains_are_stops_of_each_channel() -> None:
@@ -196,7 +196,7 @@ def test_a_test_view_is_drawn_where_its_left_half_was_taken(run: Run) -> None:
     What lies in the left half alone decides where that is."""
     view = replace(run.scene.test[0], camera=run.scene.test[0].camera.zoom(4))
     turn = torch.tensor([2.0, 6.0, 1.0], dtype=torch.float64) / view.camera.focal
-    taken = moved(view.camera, Motion(rotation=rotation_by(turn), move=torch.zeros(3, dtype=torch.float64)))
+    taken = move_camera(view.camera, Motion(rotation=rotation_by(turn), move=torch.zeros(3, dtype=torch.float64)))
     picture = render(run, taken, PIXELS).image.clamp(0, 1)
     scene, lpips = run.scene, LpipsOptions(trunk="", head="", net="vgg", input_range="unit")
     options = EvalOptions(zoom=[1], quantise=True, ssim="inria", tile_pixels=PIXELS, lpips=lpips)

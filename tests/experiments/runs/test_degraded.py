@@ -11,7 +11,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
 from gsx.experiments.runs.degraded import degrade, gains_of, pair_of
-from gsx.modules.movement import motion_blurred
+from gsx.modules.motion_blur import motion_blurred
 
 
 class GreyFile(Grey):

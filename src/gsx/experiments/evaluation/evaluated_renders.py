@@ -14,7 +14,7 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.eval_options import EvalOptions
-from gsx.modules.alignment import aligned
+from gsx.modules.alignment import estimate_camera
 
 ALIGNMENTS = 2
 """Number of times that a pose moves to where its photo was taken, each time by a new render."""
@@ -89,5 +89,5 @@ def align_camera(run: Run, view: View) -> Camera:
         rendering = render(run, camera, supersample=1, depth=True)
         assert rendering.depth is not None
         pictures = rendering.image, rendering.depth, rendering.alpha, view.image()
-        camera = aligned(camera, *pictures, left, given=view.camera)
+        camera = estimate_camera(camera, *pictures, left, prior=view.camera)
     return camera

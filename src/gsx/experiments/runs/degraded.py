@@ -13,8 +13,8 @@ from gsx.core.data.scene import DerivedSource, ImageSource, Scene, View
 from gsx.core.errors import ConfigError
 from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float, UInt8
-from gsx.modules.movement import motion_blurred
-from gsx.modules.pinned import as_taken
+from gsx.modules.derived_views import fixed_source
+from gsx.modules.motion_blur import motion_blurred
 
 BALANCE = 0.25
 """Spread of the gain of one channel, as a share of that of the exposure."""
@@ -144,7 +144,7 @@ def degrade_view(view: View, by: Mapping[str, float], slopes: tuple[float, float
     """Degrade one photo, with `slopes` of its light; a wrong pose changes the view's camera, not the photo."""
     exposure, pose, covered, moved = (by.get(kind, 0.0) for kind in ("exposure", "pose", "covered", "blur"))
     source = DegradedSource(
-        source=as_taken(view),
+        source=fixed_source(view),
         gains=gains_of(view.name, exposure) if exposure else None,
         slopes=slopes,
         patch=patch_of(view.name, covered) if covered else None,

@@ -25,7 +25,7 @@ from gsx.experiments.reports.report import write_report
 from gsx.experiments.runs.open import reopened
 from gsx.experiments.runs.progress import Countdown
 from gsx.modules.corrections import Correction
-from gsx.modules.shifts import shift_of
+from gsx.modules.image_shift import estimate_shift
 from gsx.scenes.photo_source import PhotoSource
 
 FOLDER = "photographs"
@@ -87,7 +87,7 @@ def finding(run: Run, view: View, known_sharpness: float | None, pixels: int) ->
         name=view.name,
         psnr=psnr(image, photo, counted),
         gains=gains_of(plain, photo, counted),
-        shift=shift_of(image, photo, counted),
+        shift=estimate_shift(image, photo, counted),
         concentrated=concentrated(error, counted),
         sharpness=known_sharpness,
         masked=0.0 if counted is None else 1 - float(counted.float().mean()),
