@@ -1,4 +1,4 @@
-"""Coarse views first: what a view shows at a fraction of its size is learnt in a fraction of the time.
+"""Coarse views first: steps on a view of a fraction of the size take a fraction of the time.
 
 Source: DashGaussian (Chen et al. 2025).
 """
@@ -20,16 +20,14 @@ class CoarseToFineOptions:
     """Options; values in conf/module/coarse_to_fine.yaml."""
 
     factor: Annotated[int, Range(1, 64)] = 1
-    """The first views are so many times as coarse as photos: a power of two, halved in equal times; published: 1."""
+    """Reduction of the first views: a power of two, halved in equal times; published: 1."""
     until: Share = 0.0
     """Share of the steps after which views have the size of photos."""
 
     def __post_init__(self) -> None:
         if self.factor & (self.factor - 1):
             near = 1 << self.factor.bit_length() - 1
-            raise ValueError(
-                f"training.coarse_to_fine.factor is {self.factor}; give a power of two, for example {near}"
-            )
+            raise ValueError(f"training.coarse_to_fine.factor is {self.factor}; set a power of two, for example {near}")
 
 
 class CoarseToFine(TrainingModule):
@@ -40,12 +38,12 @@ class CoarseToFine(TrainingModule):
     def __init__(self, options: CoarseToFineOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
         self.last = round(options.until * context.iterations) if options.factor > 1 else 0
-        """Last step that sees coarse views."""
+        """Last step on coarse views."""
         self.coarse: dict[int, ViewCache] = {}
         """Coarse views by factor."""
 
     def factor_at(self, step: int) -> int:
-        """Returns how many times as coarse as photos the views of a step are."""
+        """Returns the reduction of the views of a step."""
         if step > self.last or self.options.factor == 1:
             return 1
         halvings = math.log2(self.options.factor) * (max(1, step) - 1) / self.last
@@ -61,5 +59,5 @@ class CoarseToFine(TrainingModule):
         return cache.get(views, lambda: [reduce_view(view, reduction, factor) for view in views])
 
     def milestones(self) -> list[int]:
-        """Returns the last step that sees coarse views."""
+        """Returns the last step on coarse views."""
         return [self.last]

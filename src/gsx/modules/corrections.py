@@ -1,4 +1,4 @@
-"""Corrections of photos: when they are estimated, and what their options have in common."""
+"""Corrections of photos: their schedule, common options and hooks."""
 
 import logging
 import time
@@ -18,14 +18,14 @@ logger = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
 WHEN = ("never", "auto", "always")
-"""auto: correct what is found to be wrong; always: correct without a test."""
+"""auto: correct after a test; always: correct without one."""
 Times = Annotated[int, Range(1, 1000)]
 ViewCount = Annotated[int, Range(3, 10**6)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectionOptions:
-    """When a correction is estimated; values in conf/module."""
+    """Schedule of a correction; values in conf/module."""
 
     key: ClassVar[str] = ""
     """Name below `training`, for messages."""
@@ -43,12 +43,12 @@ class CorrectionOptions:
             raise ValueError(f"training.{self.key}.when is '{self.when}'; choose from {', '.join(WHEN)}")
         if not 0 < self.start < 1 or not self.start <= self.until < 1:
             raise ValueError(
-                f"training.{self.key}.start is {self.start} and training.{self.key}.until {self.until}: give shares of "
+                f"training.{self.key}.start is {self.start} and training.{self.key}.until {self.until}: set shares of "
                 "the steps between 0 and 1, the second one not smaller"
             )
 
     def steps(self, iterations: int) -> list[int]:
-        """Returns the steps before which the correction is estimated: most of them early, when a model changes most."""
+        """Returns the steps before which the correction is estimated: most of them early, when models change most."""
         if self.when == "never":
             return []
         last = max(1, self.times - 1)
@@ -57,27 +57,27 @@ class CorrectionOptions:
 
 
 class Correction(TrainingModule):
-    """A correction of photos: tested before one step, estimated before a few more where it is needed."""
+    """A correction of photos: tested before one step, estimated before a few more if needed."""
 
     options: CorrectionOptions
     seconds_key: ClassVar[str]
-    """Key of the time that an estimate takes, in metrics.jsonl."""
+    """Key of the time of an estimate in metrics.jsonl."""
     figures_key: ClassVar[str]
     """Key of its figures in evaluation.json."""
     last_estimate = 0
-    """Step before which it was estimated last: a step that is taken again does not estimate again."""
+    """Step of the last estimate: repeating that step does not estimate again."""
 
     @property
     def active(self) -> bool:
-        """Whether photos are corrected now."""
+        """True if photos are corrected now."""
         raise NotImplementedError
 
     def estimate(self, run: Run, step: int) -> dict[str, float]:
-        """Test and estimate before a step; returns metrics for its line."""
+        """Tests and estimates the correction before a step; returns metrics for its line."""
         raise NotImplementedError
 
     def before_step(self, run: Run) -> dict[str, float]:
-        """Estimate the correction if it is due before the next step."""
+        """Estimates the correction if it is due before the next step."""
         step = run.step + 1
         if not self.due(step):
             return {}
@@ -86,7 +86,7 @@ class Correction(TrainingModule):
         return metrics | {self.seconds_key: round(time.perf_counter() - start, 3)}
 
     def due(self, step: int) -> bool:
-        """Returns whether it is estimated before a step: before the first of its steps, then only if it is active."""
+        """Checks if it is estimated before a step: before the first of its steps, then only if it is active."""
         steps = self.milestones()
         return step in steps and step > self.last_estimate and (step == steps[0] or self.active)
 
@@ -95,11 +95,11 @@ class Correction(TrainingModule):
         return self.options.steps(self.context.iterations)
 
     def supports(self, ranks: int) -> bool:
-        """Returns whether it is off or one process trains: ranks do not estimate together."""
+        """Returns True if it is off or one process trains: ranks do not estimate together."""
         return ranks == 1 or self.options.when == "never"
 
     def restarted(self, context: ModuleContext) -> TrainingModule:
-        """Returns the module for another run; it corrects nothing where that run's views are corrected already."""
+        """Returns the module for another run; off where that run's views are corrected already."""
         return type(self)(type(self.options)() if self.in_views else self.options, context)
 
     @classmethod
@@ -109,7 +109,7 @@ class Correction(TrainingModule):
 
     @classmethod
     def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """Returns the figures of its estimates and the seconds that they took; a stop before a step loses its line."""
+        """Returns the figures of its estimates and their seconds; a stop before a step loses its line."""
         estimates = [line for line in lines if cls.seconds_key in line]
         if not estimates:
             return {}
@@ -119,12 +119,12 @@ class Correction(TrainingModule):
 
 @dataclass(eq=False)
 class ViewCache:
-    """Views made from lists of views: the same result for the same list, until the cache is replaced."""
+    """Lists of views by the list that they were made from."""
 
     made: list[tuple[Sequence[View], list[View]]] = field(default_factory=list)
 
     def get(self, views: Sequence[View], make: Callable[[], list[View]]) -> list[View]:
-        """Returns what was made of this list, or makes it."""
+        """Returns the list made from this one; makes it at the first call."""
         for source, made in self.made:
             if source is views:
                 return made
@@ -133,18 +133,18 @@ class ViewCache:
 
 
 def sample(items: Sequence[Item], count: int, purpose: str) -> list[Item]:
-    """Returns at most so many of the items, in random order: the same in every run."""
+    """Returns at most `count` items, in a random order that is the same in every run."""
     generator = torch.Generator().manual_seed(derived_seed(purpose))
     order = torch.randperm(len(items), generator=generator)[:count]
     return [items[index] for index in order.tolist()]
 
 
-def log_test(step: int, what: str, value: float, threshold: float, show: Callable[[float], str], verdict: str) -> None:
-    """Log a test before a step: its value, the threshold, and what follows; show: writes both with their unit."""
+def log_test(step: int, what: str, value: float, threshold: float, write: Callable[[float], str], action: str) -> None:
+    """Logs a test before a step: value, threshold and action; `write`: formats both with their unit."""
     sign = ">" if value > threshold else "<="
-    logger.info("step %d: %s %s %s %s, %s", step, what, show(value), sign, show(threshold), verdict)
+    logger.info("step %d: %s %s %s %s, %s", step, what, write(value), sign, write(threshold), action)
 
 
 def percent(share: float) -> str:
-    """Writes a share in percent."""
+    """Formats a share in percent."""
     return f"{100 * share:.1f} %"

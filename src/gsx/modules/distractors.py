@@ -1,8 +1,8 @@
-"""Distractors: what stands before the scene in one training photo alone does not count.
+"""Distractors: objects in front of the scene in a single training photo, which are masked.
 
-One test on some photos decides whether there are any (`modules.distractor_masks`). If so, all photos are searched, and
-again a few times as the model learns more. Pixels that show a distractor enter no loss, no growth and no figure from
-then on, as if a mask had left them out, but for pseudo views that were made before. Test photos play no part.
+A test on some photos decides if there are any (`modules.distractor_masks`). If so, all photos are searched, and again a
+few times as the model improves. Pixels of distractors enter no loss, growth or figure from then on, as with a mask of
+the user's; pseudo views made before stay. Test photos are not used.
 """
 
 import logging
@@ -50,7 +50,7 @@ class DistractorOptions(CorrectionOptions):
     times: Times = 6
     """Number of searches, at shares that grow by the same factor."""
     share: Annotated[float, Range(0, 1)] = 0.03
-    """`auto`: share of the tested pixels that show distractors, above which these do not count."""
+    """`auto`: share of distractors in the tested pixels above which photos are masked."""
     views: ViewCount = 24
     """Most photos that the test uses."""
 
@@ -66,12 +66,12 @@ class Distractors(Correction):
     def __init__(self, options: DistractorOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
         self.masks: Sequence[Bool[Tensor, "h w"]] | None = None
-        """Pixels that show a distractor, of each photo in order; None: no photo is masked."""
+        """Pixels of distractors, by photo in order; None: no photo is masked."""
         self.cache = ViewCache()
 
     @property
     def active(self) -> bool:
-        """Whether photos are masked."""
+        """True if photos are masked."""
         return self.masks is not None
 
     def transform_views(self, views: Sequence[View], step: int | None) -> Sequence[View]:
@@ -84,9 +84,9 @@ class Distractors(Correction):
     # -- estimates -----------------------------------------------------------------------------------------------------
 
     def estimate(self, run: Run, step: int) -> dict[str, float]:
-        """Test whether photos show distractors, where that is due first, and mask those of all photos if so.
+        """Tests if photos show distractors, at first, and masks those of all photos if so.
 
-        Primitives that mostly show masked pixels go: what they show was learnt before.
+        Removes primitives that are mostly visible in masked pixels, from which they were learnt.
         """
         views, metrics, needed = run.views.without(self).full_size, dict[str, float](), True
         differences = dict[View, Difference]()
@@ -95,13 +95,13 @@ class Distractors(Correction):
             share = mean_share(distractors_in(list(differences.values())))
             needed = self.options.when == "always" or share > self.options.share
             metrics["distractor_share"] = share
-            verdict = "masking photos" if needed else "all pixels count"
-            log_test(step, "distractors", share, self.options.share, percent, verdict)
+            action = "masking photos" if needed else "all pixels count"
+            log_test(step, "distractors", share, self.options.share, percent, action)
         if needed:
             differences |= measure_differences(run, [view for view in views if view not in differences])
         masks = distractors_in([differences[view] for view in views]) if needed else None
         removed = None if masks is None else rows_of_distractors(run, mask_views(views, masks))
-        metrics["distractors"] = self.mask(masks, step)  # with their primitives, or neither
+        metrics["distractors"] = self.mask(masks, step)  # nothing can fail between masks and removal
         if removed is not None:
             metrics["forgotten"] = remove_rows(run, removed)
             logger.info(
@@ -111,39 +111,39 @@ class Distractors(Correction):
         return metrics
 
     def mask(self, masks: Sequence[Bool[Tensor, "h w"]] | None, step: int) -> float:
-        """Use these masks from a step on; returns their mean share of the pixels."""
+        """Uses these masks from a step on; returns their mean share of the pixels."""
         self.masks, self.last_estimate, self.cache = masks, step, ViewCache()
         return mean_share(masks or [])
 
     # -- files ---------------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Returns the masks; empty where there are none."""
+        """Returns the masks; empty without any."""
         if self.masks is None:
             return {}
         masks = {str(index): mask for index, mask in enumerate(self.masks)}
         return {"looked": torch.tensor(self.last_estimate)} | masks
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on from a checkpoint; empty: all pixels count."""
+        """Restores a checkpoint; empty: all pixels count."""
         masks = [tensors[str(index)].clone() for index in range(len(tensors) - 1)] if tensors else None
         self.mask(masks, int(tensors["looked"]) if tensors else 0)
 
     @classmethod
     def figures(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """Returns when photos were tested, the share that the test found, and the masked shares since."""
+        """Returns the step and the share of the test, and the masked shares since."""
         masked = [line["distractors"] for line in lines] if any(line["distractors"] for line in lines) else []
         shares = [line["distractor_share"] for line in lines if "distractor_share" in line]
         return {"step": lines[0]["step"], "share": (shares or [None])[0], "marked": masked}
 
     @classmethod
     def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
-        """Yields that parts of training photos do not count."""
+        """Reports masked parts of training photos."""
         figures = evaluation.get("distractors") or {}
         if figures.get("marked"):
             yield (
-                f"{figures['marked'][-1]:.1%} of the pixels of training photos show what others do not, and do not "
-                f"count from step {figures['step']:,} on"
+                f"{figures['marked'][-1]:.1%} of the pixels of training photos show distractors and do not count from "
+                f"step {figures['step']:,} on"
             )
 
 
@@ -163,7 +163,7 @@ def measure_difference(run: Run, view: View) -> Difference:
 
 
 def rows_of_distractors(run: Run, views: Sequence[View]) -> Bool[Tensor, "N"]:
-    """Returns the primitives that are mostly visible where pixels of photos do not count."""
+    """Returns the primitives that are mostly visible in masked pixels."""
     probe = Probe(model=run.backbone, views=run.views, step=run.model_step)
     hidden, total = run.background.new_zeros(2, len(run.backbone.table))
     for view in views:
@@ -175,7 +175,7 @@ def rows_of_distractors(run: Run, views: Sequence[View]) -> Bool[Tensor, "N"]:
 
 
 def remove_rows(run: Run, rows: Bool[Tensor, "N"]) -> int:
-    """Remove primitives, unless they are all; returns how many."""
+    """Removes primitives, unless it is all of them; returns their number."""
     if bool(rows.all()):
         return 0
     keep_rows(run.backbone.table, ~rows)
@@ -192,15 +192,15 @@ def mean_share(masks: Sequence[Bool[Tensor, "h w"]]) -> float:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MaskedSource(DerivedSource):
-    """A photo of which the blocks that show a distractor do not count."""
+    """A photo with masked blocks."""
 
     masked: Bool[Tensor, "h w"]
-    """Blocks of whole pixels of the photo that show one; the last row and column take what is left over."""
+    """Masked blocks of whole pixels of the photo; the last row and column include the remaining pixels."""
     size: tuple[int, int]
     """(width, height) of the photo, px."""
 
     def counted(self, camera: Camera) -> Bool[Tensor, "H W"]:
-        """Returns the pixels that count in the other source and show no distractor."""
+        """Returns the pixels that count in the other source and are not masked."""
         (height, width), frame = self.masked.shape, camera.frame
         down = block_of(frame.top, camera.height, frame.height, self.size[1], height)
         across = block_of(frame.left, camera.width, frame.width, self.size[0], width)
@@ -208,26 +208,26 @@ class MaskedSource(DerivedSource):
         return clear if counted is None else clear & counted
 
     def transparent(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
-        """Returns the pixels of the other source that show the background alone."""
+        """Returns the pixels of the other source that show only the background."""
         return self.source.transparent(camera) if isinstance(self.source, CutOut) else None
 
 
 def block_of(first: int, count: int, frame: int, size: int, blocks: int) -> Int[Tensor, "P"]:
-    """Returns the block of each of `count` pixels, the first of them at `first` of a frame, along an axis of a photo.
+    """Returns the block of each of `count` pixels from `first` on along an axis.
 
-    frame: pixels of the whole photo at the scale of these. size: px of the photo. blocks: of the photo.
+    frame: pixels of the whole photo at their scale. size: px of the photo. blocks: of the photo.
     """
     places = (torch.arange(count) + 0.5 + first) / frame * size
     return (places / max(1, size // blocks)).long().clamp(0, blocks - 1)
 
 
 def mask_views(views: Sequence[View], masks: Sequence[Bool[Tensor, "h w"]]) -> list[View]:
-    """Returns views without what is masked in their photos."""
+    """Returns views with masked photos."""
     return [mask_view(view, mask) for view, mask in zip(views, masks, strict=True)]
 
 
 def mask_view(view: View, mask: Bool[Tensor, "h w"]) -> View:
-    """Returns the view without what is masked in its photo: of a coarse pixel no part may be."""
+    """Returns the view with a masked photo; a coarse pixel counts if no part of it is masked."""
     if not bool(mask.any()):
         return view
     if isinstance(view.source, CoarseSource):

@@ -1,11 +1,11 @@
-"""Exposure and white balance of each photo, learnt with the model where photos differ in them.
+"""Exposure and white balance of each photo, learnt with the model if photos differ.
 
-A photo is compared with A [r, g, b, 1]^T of its render: A has 3 x 4 numbers per training photo and is learnt by Adam
-(3D-GS release, `exposure_lr_init`, `exposure_lr_final`). Ours: a test decides whether photos have exposures. They start
-from the gains between photos and renders instead of the identity, and these gains correct them a few times, since early
-renders say little. Their mean stays the identity, so that the model has the exposure of the mean photo. Adam counts the
-steps of each photo apart: one Adam over all of them, as published, goes on moving a photo while others are trained on,
-by several rates per visit. Where light differs within photos a bilateral grid comes behind A (`bilateral_grid`).
+A photo is compared with A [r, g, b, 1]^T of its render: a 3 x 4 matrix A per training photo, learnt by Adam (3D-GS
+release, `exposure_lr_init`, `exposure_lr_final`). Ours: a test decides if exposures are learnt. They start from the
+gains between photos and renders, not the identity, and such gains correct them a few times, since early renders are
+poor. Their mean stays the identity: the model has the exposure of the mean photo. Adam counts steps per photo: one Adam
+over all photos, as published, keeps moving a photo during the steps of others, by several rates per visit. Where light
+differs within photos a bilateral grid follows A (`bilateral_grid`).
 """
 
 import logging
@@ -21,11 +21,11 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.quality.colour_matrix import transform_colours
 from gsx.core.ranges import Range
-from gsx.core.shapes import Bool, Float
+from gsx.core.shapes import Float
 from gsx.core.training.module import ModuleContext
 from gsx.core.training.run import Run
 from gsx.core.training.schedule import log_linear
-from gsx.modules.bilateral_grid import WHOLE, apply_grid, initial_grids, light_slopes, without_common
+from gsx.modules.bilateral_grid import WHOLE, Edges, apply_grid, initial_grids, light_slopes, without_common
 from gsx.modules.corrections import WHEN, Correction, CorrectionOptions, ViewCount, log_test, percent, sample
 from gsx.modules.photo_pairs import LIGHT, Pair, log_gains, render_reduced, shared_spread, usable_pixels
 
@@ -33,8 +33,8 @@ logger = logging.getLogger(__name__)
 
 PositiveRate = Annotated[float, Range(1e-9, 1)]
 BETAS, EPS = (0.9, 0.99), 1e-8
-"""Of Adam; a short run visits a photo a few dozen times."""
-EQUAL = "photos are taken as equal"
+"""Adam's constants; a short run visits a photo a few dozen times."""
+EQUAL = "photos are treated as equal"
 MIN_BLOCK_PIXELS = 16
 """Fewest usable pixels of a block of a photo."""
 
@@ -45,7 +45,7 @@ class ExposureOptions(CorrectionOptions):
 
     key: ClassVar[str] = "exposure"
     spread: Annotated[float, Range(0, 1)] = 0.06
-    """`auto`: standard deviation of log gains above which photos get exposures; those with grids have them."""
+    """`auto`: standard deviation of log gains above which photos get exposures; with grids they always do."""
     grid: str = "never"
     """One of WHEN; auto: a bilateral grid per photo where light differs within photos."""
     grid_spread: Annotated[float, Range(0, 1)] = 0.08
@@ -63,8 +63,8 @@ class ExposureOptions(CorrectionOptions):
             raise ValueError(f"training.exposure.grid is '{self.grid}'; choose from {', '.join(WHEN)}")
         if self.when == "never" != self.grid:
             raise ValueError(
-                f"training.exposure.grid is '{self.grid}', but training.exposure.when is 'never': a grid comes behind "
-                "an exposure; set training.exposure.when=auto"
+                f"training.exposure.grid is '{self.grid}', but training.exposure.when is 'never': a grid needs "
+                "exposures; set training.exposure.when=auto"
             )
 
 
@@ -73,10 +73,10 @@ class ExposureOptions(CorrectionOptions):
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """How a photo's light differs from its render's."""
+    """Light of a photo relative to its render."""
 
     gains: Float[Tensor, "3 3"]
-    """Log gains of the whole picture, of its left and of its right half; nan where pixels are too few."""
+    """Log gains of the whole image, of its left and of its right half; nan where pixels are too few."""
     slopes: Float[Tensor, "3 2 3"] | None
     """Slopes of log gains (`light_slopes`); None: not measured."""
 
@@ -86,19 +86,13 @@ Measure: TypeAlias = Callable[[int], Light]
 
 
 def light_of(pair: Pair, slopes: bool) -> Light:
-    """Measure a photo's light; slopes: also within the photo."""
+    """Measures a photo's light; slopes: also within the photo."""
     image, photo, _ = pair
     within = light_slopes(image, photo, usable_pixels(*pair), MIN_BLOCK_PIXELS) if slopes else None
-    return Light(half_gains(*pair), within)
-
-
-def half_gains(image: Tensor, photo: Tensor, mask: Bool[Tensor, "H W"] | None) -> Float[Tensor, "3 3"]:
-    """Returns log gains of the whole picture, of its left and of its right half."""
     half = image.shape[2] // 2
     parts = (slice(None), slice(half), slice(half, None))
-    return torch.stack(
-        [log_gains(image[..., part], photo[..., part], None if mask is None else mask[..., part]) for part in parts]
-    )
+    halves = [[None if values is None else values[..., part] for values in pair] for part in parts]
+    return Light(torch.stack([log_gains(*half) for half in halves]), within)
 
 
 def spreads_of(lights: Sequence[Light]) -> tuple[float, float]:
@@ -110,7 +104,7 @@ def spreads_of(lights: Sequence[Light]) -> tuple[float, float]:
 
 
 def relative_gains(lights: Sequence[Light]) -> Float[Tensor, "N 3"]:
-    """Returns log gains of photos relative to their mean, which is the model's; 0 where they are unknown."""
+    """Returns log gains of photos relative to their mean, the model's exposure; 0 where they are unknown."""
     gains = torch.stack([light.gains[0] for light in lights])
     return (gains - gains.nanmean(0)).nan_to_num(0.0)
 
@@ -144,17 +138,17 @@ class Exposure(Correction):
 
     @property
     def active(self) -> bool:
-        """Whether photos have exposures."""
+        """True if photos have exposures."""
         return self.matrices is not None
 
     def due(self, step: int) -> bool:
-        """Returns whether exposures are estimated before a step; grids know more than gains say."""
+        """Checks if exposures are estimated before a step: with grids only once, since gains know less."""
         return self.grids is None and super().due(step)
 
     # -- estimates -----------------------------------------------------------------------------------------------------
 
     def estimate(self, run: Run, step: int) -> dict[str, float]:
-        """Test whether photos differ in exposure, or correct what is learnt by gains between photos and renders."""
+        """Tests if photos differ in exposure, or corrects exposures by gains between photos and renders."""
         views = run.train_views
 
         def measure(index: int) -> Light:
@@ -167,9 +161,9 @@ class Exposure(Correction):
         return {"exposures": self.count, "exposure_motion": change}
 
     def test(self, measure: Measure, step: int) -> tuple[float, float]:
-        """Measure some photos, and start from the gains of all if they differ; returns spreads of gains and slopes.
+        """Measures some photos, and starts from the gains of all if they differ.
 
-        The spread of slopes is nan where grids are off.
+        Returns the spreads of gains and of slopes; nan where grids are off.
         """
         options, everyone = self.options, range(self.count)
         lights = {index: measure(index) for index in sample(everyone, options.views, "exposures")}
@@ -181,14 +175,14 @@ class Exposure(Correction):
         return spread, within
 
     def correct(self, measure: Measure, step: int) -> float:
-        """Correct the exposures; returns by how much they were off: RMS of log gains."""
+        """Corrects the exposures; returns their RMS error, of log gains."""
         lights = [measure(index) for index in range(self.count)]
         self.restart(lights, with_grids=False, step=step)
         return float(relative_gains(lights).square().mean().sqrt())
 
     @torch.no_grad()
     def restart(self, lights: Sequence[Light], with_grids: bool, step: int) -> None:
-        """Go on learning from the present exposures times the gains of the photos."""
+        """Restarts learning from the present exposures times the gains of the photos."""
         gains = relative_gains(lights).exp()
         now = torch.eye(3, 4).expand(self.count, -1, -1) if self.matrices is None else self.matrices.cpu()
         slopes = [light.slopes[0] for light in lights if with_grids and light.slopes is not None]
@@ -197,7 +191,7 @@ class Exposure(Correction):
         self.last_estimate = step
 
     def start(self, matrices: Float[Tensor, "N 3 4"], grids: Float[Tensor, "N rank 3 4"] | None = None) -> None:
-        """Learn from these on."""
+        """Starts learning from these exposures and grids."""
         device = self.context.device
         self.matrices = matrices.to(device).requires_grad_()
         self.moments, self.visits = torch.zeros(2, *matrices.shape, device=device), torch.zeros(len(matrices))
@@ -209,24 +203,15 @@ class Exposure(Correction):
     def transform_render(
         self, image: Tensor, view: View, photo: Tensor | None, window: Window | None, learning: bool
     ) -> Tensor:
-        """Returns the render at its photo's exposure; of a saturated value of the photo, more is no error."""
+        """Returns the render at its photo's exposure; where the photo is saturated, more is no error."""
         if self.matrices is None:
             return image
         edges = WHOLE if window is None else window.shares(*view.camera.size)
         exposed = self.expose(image, self.indices[view.name], learning, edges)
         return exposed if photo is None else torch.where((photo >= 1) & (exposed > 1), photo, exposed)
 
-    def expose(
-        self,
-        image: Float[Tensor, "3 H W"],
-        index: int,
-        learning: bool = False,
-        edges: tuple[float, float, float, float] = WHOLE,
-    ) -> Float[Tensor, "3 H W"]:
-        """Returns the render at the exposure of a photo, which there must be.
-
-        edges: left, top, right, bottom of the render, as shares of the photo's sides.
-        """
+    def expose(self, image: Tensor, index: int, learning: bool = False, edges: Edges = WHOLE) -> Tensor:
+        """Returns the render [3 H W], or its part between these edges, at the exposure of a photo."""
         assert self.matrices is not None
         if learning:
             self.rendered.add(index)
@@ -242,7 +227,7 @@ class Exposure(Correction):
 
     @torch.no_grad()
     def optimizer_step(self, step: int) -> None:
-        """Take one step of Adam for each photo that was rendered; keep the mean exposure the identity."""
+        """Takes a step of Adam for each rendered photo; keeps the mean exposure the identity."""
         if self.matrices is None or self.matrices.grad is None:
             return
         learnt = [(self.matrices, self.moments), (self.grids, self.grid_moments)]
@@ -258,7 +243,7 @@ class Exposure(Correction):
         self.zero_grad()
 
     def zero_grad(self) -> None:
-        """Drop the gradients of a step."""
+        """Drops the gradients of a step."""
         self.rendered.clear()
         for values in (self.matrices, self.grids):
             if values is not None:
@@ -267,7 +252,7 @@ class Exposure(Correction):
     # -- files ---------------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Returns exposures and Adam's state; empty where there are none."""
+        """Returns exposures and Adam's state; empty without exposures."""
         if self.matrices is None:
             return {}
         tensors = {"matrices": self.matrices.detach(), "moments": self.moments, "visits": self.visits}
@@ -277,7 +262,7 @@ class Exposure(Correction):
         return tensors | {"grids": self.grids.detach(), "grid_moments": self.grid_moments}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on from a checkpoint; empty: there are no exposures."""
+        """Restores a checkpoint; empty: there are no exposures."""
         self.matrices, self.grids, self.last_estimate = None, None, 0
         if not tensors:
             return
@@ -290,7 +275,7 @@ class Exposure(Correction):
 
     @classmethod
     def figures(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """Returns when photos were tested, the spreads, how many are corrected, and the changes since."""
+        """Returns the step of the test, the spreads, the number of corrected photos, and the changes since."""
         first, motions = lines[0], [line["exposure_motion"] for line in lines if "exposure_motion" in line]
         figures = {"step": first["step"], "spread": first.get("exposure_spread"), "learnt": first["exposures"]}
         grids = {"within": first["light_spread"], "grids": first["grids"]} if "light_spread" in first else {}
@@ -298,7 +283,7 @@ class Exposure(Correction):
 
     @classmethod
     def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
-        """Yields that photos have exposures, which the model has none of."""
+        """Reports that photos have exposures, and the model that of the mean photo."""
         figures = evaluation.get("exposures") or {}
         if figures.get("learnt"):
             spread = "differ" if figures["spread"] is None else f"are spread by {figures['spread']:.1%}"
@@ -314,10 +299,7 @@ class Exposure(Correction):
 
 
 def photo_pair(run: Run, view: View) -> Pair:
-    """Returns a reduced render at its photo's exposure, the photo, and the pixels that count.
-
-    Pixels that are light in the render at the model's exposure do not count: it is cut off there.
-    """
+    """Returns a reduced render at its photo's exposure, the photo, and the pixels that count and are not saturated."""
     small, rendering = render_reduced(run, view, depth=False)
     image = run.views.match_photo(rendering.image, None, small).detach().cpu()
     below, mask = (rendering.image < LIGHT).all(0), small.counted()
@@ -325,20 +307,20 @@ def photo_pair(run: Run, view: View) -> Pair:
 
 
 def log_tests(module: Exposure, step: int, spread: float, within: float) -> dict[str, float]:
-    """Log the spreads that a test measured and what follows; returns them for the line of the step."""
+    """Logs the spreads of a test and what follows; returns them for the line of the step."""
     options, active, grids = module.options, module.active, module.grids is not None
-    verdict = "learning one per photo" if active else EQUAL
-    log_test(step, "exposure spread", spread, options.spread, percent, verdict)
+    action = "learning one per photo" if active else EQUAL
+    log_test(step, "exposure spread", spread, options.spread, percent, action)
     metrics = {"exposure_spread": spread, "exposures": module.count if active else 0}
     if math.isnan(within):
         return metrics
-    verdict = "learning grids" if grids else EQUAL
-    log_test(step, "light spread within photos", within, options.grid_spread, percent, verdict)
+    action = "learning grids" if grids else EQUAL
+    log_test(step, "light spread within photos", within, options.grid_spread, percent, action)
     return metrics | {"light_spread": within, "grids": module.count if grids else 0}
 
 
 def adam_direction(moments: Float[Tensor, "2 *S"], gradient: Float[Tensor, "*S"], steps: float) -> Float[Tensor, "*S"]:
-    """Returns Adam's direction for one photo at its step of that number; changes its moments in place."""
+    """Returns Adam's direction at a photo's step number `steps`; updates its moments in place."""
     means = []
     for moment, beta, value in zip(moments, BETAS, (gradient, gradient.square()), strict=True):
         moment.mul_(beta).add_((1 - beta) * value)

@@ -1,4 +1,4 @@
-"""Photos beside the model's renders, as corrections are estimated from them."""
+"""Pairs of a photo and its render, from which corrections are estimated."""
 
 import math
 from typing import TypeAlias
@@ -16,15 +16,15 @@ from gsx.modules.derived_views import reduce_view
 Pair: TypeAlias = tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"], Bool[Tensor, "H W"] | None]
 """Render, photo, mask of the pixels that count (None: all)."""
 REDUCTION = 2
-"""Estimates use views so many times smaller than photos: they take a third of the time."""
+"""Reduction of the views of estimates, which then take a third of the time."""
 DARK, LIGHT = 0.05, 0.95
-"""Display values between which a ratio is a gain: below is noise, above values may be saturated."""
+"""Range of display values for gains: below is noise, above values may be saturated."""
 MIN_PIXELS, MIN_VIEWS = 64, 3
-"""Fewest pixels of which a gain is computed, and fewest views of which a spread is."""
+"""Fewest pixels for a gain, fewest views for a spread."""
 
 
 def render_reduced(run: Run, view: View, depth: bool = True, min_pixels: int = 0) -> tuple[View, TiledRendering]:
-    """Returns a reduced view and its render; the view as it is where the reduced one had fewer pixels."""
+    """Returns (the view reduced by REDUCTION, its render); not reduced where fewer than `min_pixels` would be left."""
     run.raise_if_stopping()
     pixels = view.camera.width * view.camera.height / REDUCTION**2
     small = reduce_view(view, run.scene.reduction, REDUCTION) if pixels >= min_pixels else view
@@ -52,22 +52,22 @@ def log_gains(
 def gains(
     image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"], mask: Bool[Tensor, "H W"] | None
 ) -> Float[Tensor, "3"]:
-    """Returns how many times as bright as its render a photo is, by channel; 1 where pixels are too few."""
+    """Returns the brightness of a photo relative to its render, by channel; 1 where pixels are too few."""
     return log_gains(image, photo, mask).nan_to_num(0.0).exp()
 
 
 def match_brightness(
     image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"], mask: Bool[Tensor, "H W"] | None
 ) -> Float[Tensor, "3 H W"]:
-    """Returns a render as bright in each channel as its photo, and as saturated."""
+    """Returns a render scaled to the brightness of its photo, by channel, and clamped."""
     return (gains(image, photo, mask)[:, None, None] * image).clamp(0, 1)
 
 
 def shared_spread(left: Float[Tensor, "N C"], right: Float[Tensor, "N C"]) -> float:
-    """Returns the standard deviation over photos of what both halves of a photo measure, in the mean over channels.
+    """Returns the standard deviation over photos that both halves of a photo share, in the mean over channels.
 
-    It is the root of the covariance of the halves, which their noise does not enter; 0 where that is negative, or
-    fewer than MIN_VIEWS photos have both halves.
+    The root of the covariance of the halves, free of their noise; 0 where that is negative, or fewer than MIN_VIEWS
+    photos have both halves.
     """
     known = (left.isfinite() & right.isfinite()).all(1)
     if int(known.sum()) < MIN_VIEWS:

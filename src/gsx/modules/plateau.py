@@ -1,10 +1,9 @@
-"""Steps that would gain too little are skipped: a run goes on with its last part where validation windows say so.
+"""Skips steps that gain too little on validation windows: a run then continues with its last part.
 
-From `start` on, windows of some training views enter no loss while the number of steps grows by a tenth. They are
-rendered at both ends of these steps. The difference of their errors is the gain of the steps where nothing was learnt
-from the pixels themselves, in dB per doubling of the steps: the unit of the price. Below the price the run goes on at
-`to`, with what its schedules do at the end (finer pixels, learning rates that decay). With every such tenth windows
-move to other views and places. Test views play no part.
+From `start` on, windows of some training views enter no loss while the number of steps grows by a tenth. The difference
+of their errors at both ends is the gain of these steps on pixels that were not learnt, in dB per doubling of the steps:
+the unit of the price. Below the price the run continues at `to`, with the end of its schedules (finer pixels, decaying
+learning rates). Each test uses windows of other views. Test views are not used.
 """
 
 import logging
@@ -29,7 +28,7 @@ from gsx.core.training.validation import decibels, rounding_in, validation_windo
 logger = logging.getLogger(__name__)
 
 GROWTH = 10
-"""A test takes one more step for so many steps before, but at least a pass over the views."""
+"""A test takes one step per this many earlier steps, but at least a pass over the views."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,11 +36,11 @@ class PlateauOptions:
     """Options; values in conf/module/plateau.yaml."""
 
     price: Annotated[float, Range(0, 100)] = 0.0
-    """dB that a doubling of the steps has to bring; 0: no step is skipped."""
+    """Least gain of a doubling of the steps, dB; 0: no step is skipped."""
     start: Share = 0.5
     """Share of the steps before any are skipped."""
     to: Share = 0.8
-    """Share of the steps at which a run goes on."""
+    """Share of the steps at which a run continues."""
     views: Annotated[int, Range(1, 1000)] = 6
     """Training views that have a validation window at a time."""
     window: Annotated[float, Range(0.05, 1)] = 0.5
@@ -50,13 +49,13 @@ class PlateauOptions:
     def __post_init__(self) -> None:
         if self.price > 0 and not 0 < self.start < self.to:
             raise ValueError(
-                f"training.plateau.start is {self.start} and training.plateau.to {self.to}: give shares of the steps "
+                f"training.plateau.start is {self.start} and training.plateau.to {self.to}: set shares of the steps "
                 "above 0, the first one smaller"
             )
 
 
 class Plateau(TrainingModule):
-    """Tests what the steps gain, and skips those that gain too little."""
+    """A test of the gain of steps, which skips those that gain too little."""
 
     options: PlateauOptions
 
@@ -65,36 +64,36 @@ class Plateau(TrainingModule):
         self.one_pass = -(-len(context.scene.train) // context.batch)
         """Steps of a pass over the training views."""
         self.resume_at = round(options.to * context.iterations)
-        """Step that is taken next where the steps before it are skipped."""
+        """First step after skipped ones."""
         self.test_start = 0
-        """Step after which the windows of the moment begin; 0: there are none."""
+        """Step after which the current windows begin; 0: none."""
         self.before: Float[Tensor, W] = torch.zeros(0, dtype=torch.float64)
-        """Squared error in each of the windows at that step."""
+        """Squared error in each window at that step."""
         self.gains: Float[Tensor, "T 3"] = torch.zeros(0, 3, dtype=torch.float64)
         """Step, gain in dB per doubling of the steps, and its standard error, of each test."""
         self.skipped = range(0)
-        """Numbers of the steps that were skipped."""
+        """Skipped steps."""
 
     # -- when ----------------------------------------------------------------------------------------------------------
 
     def first_test(self, run: Run) -> int:
-        """Returns the step after which the first windows begin: nothing that happens once must be skipped."""
+        """Returns the step after which the first windows begin: after all milestones before `resume_at`."""
         return max(1, round(self.options.start * self.context.iterations), last_milestone(run, self.resume_at))
 
     def test_end(self, start: int) -> int:
-        """Returns the step after which windows that began after a step are tested."""
+        """Returns the step after which windows from `start` are tested."""
         return start + max(math.ceil(start / GROWTH), self.one_pass)
 
     def testing(self, run: Run) -> bool:
-        """Returns whether there are windows, which belong to this schedule and not to one before `gsx resume`."""
+        """Checks if there are windows, of this schedule and not of one before `gsx resume`."""
         return self.options.price > 0 and self.test_start > 0 and self.test_start >= self.first_test(run)
 
     def test_ends_after(self, run: Run, step: int) -> bool:
-        """Returns whether the windows of the moment are tested after this step."""
+        """Checks if the current windows are tested after this step."""
         return self.testing(run) and step == self.test_end(self.test_start)
 
     def test_starts_after(self, run: Run, step: int) -> bool:
-        """Returns whether windows begin after this step: there must be steps left to skip."""
+        """Checks if windows begin after this step: there must be steps left to skip."""
         if self.options.price == 0:
             return False
         due = self.test_end(self.test_start) if self.testing(run) else self.first_test(run)
@@ -103,7 +102,7 @@ class Plateau(TrainingModule):
     # -- hooks ---------------------------------------------------------------------------------------------------------
 
     def before_step(self, run: Run) -> dict[str, float]:
-        """Test what the last steps have gained, if that is due, and skip steps if it is too little."""
+        """Tests the gain of the last steps, if due, and skips steps if it is too small."""
         done = run.step
         ended = self.windows(run.views.at(done), self.test_start) if self.test_ends_after(run, done) else {}
         started = self.windows(run.views.at(done + 1), done) if self.test_starts_after(run, done) else {}
@@ -124,7 +123,7 @@ class Plateau(TrainingModule):
         return () if window is None else (window,)
 
     def plan(self, run: Run) -> dict[str, Any]:
-        """Returns when steps may be skipped."""
+        """Returns the range of steps that may be skipped."""
         if self.options.price == 0:
             return {}
         start = self.first_test(run)
@@ -138,7 +137,7 @@ class Plateau(TrainingModule):
         return {"numbers": numbers, "before": self.before, "found": self.gains}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on from a checkpoint."""
+        """Restores a checkpoint."""
         if tensors:
             self.test_start, start, stop = tensors["numbers"].tolist()
             self.before, self.gains, self.skipped = tensors["before"], tensors["found"], range(start, stop)
@@ -150,14 +149,11 @@ class Plateau(TrainingModule):
         return validation_windows(views, self.options.views, self.options.window, "plateau", start)
 
     def start_test(self, step: int, before: Float[Tensor, "W"]) -> None:
-        """Begin windows after a step, at which they have these errors."""
+        """Begins windows after a step, with their errors there."""
         self.test_start, self.before = step, before
 
     def finish_test(self, windows: Mapping[View, Window], after: Float[Tensor, "W"], step: int) -> None:
-        """Compute the gain since the windows began, if pixels of them count, and skip steps if it is below the price.
-
-        There are no windows then.
-        """
+        """Ends the windows, computes their gain, if any of their pixels count, and skips steps if it is too small."""
         rounding, start, before = rounding_in(windows), self.test_start, self.before
         self.test_start, self.before = 0, before[:0]
         if not bool(rounding.any()):
@@ -165,17 +161,16 @@ class Plateau(TrainingModule):
         gain, error = (value / math.log2(step / start) for value in decibels(after + rounding, before + rounding))
         self.gains = torch.cat([self.gains, torch.tensor([[step, gain, error]], dtype=torch.float64)])
         price = self.options.price
-        verdict = f"skipping to step {self.resume_at}" if gain < price else "going on"
-        sign = "<" if gain < price else ">="
+        sign, action = ("<", f"skipping to step {self.resume_at}") if gain < price else (">=", "continuing")
         logger.info(
             "step %d: gain %.2f +- %.2f dB per doubling of the steps, over the last %d, %s price %.2f: %s",
-            *(step, gain, error, step - start, sign, price, verdict),
+            *(step, gain, error, step - start, sign, price, action),
         )
         if gain < price:
             self.skipped = range(step + 1, self.resume_at)
 
     def metrics_at(self, step: int) -> dict[str, float]:
-        """Returns the gain that was computed, and the number of steps skipped, just before a step."""
+        """Returns the gain of a test that ended just before a step, and the number of skipped steps."""
         if not len(self.gains) or step not in (int(self.gains[-1, 0]) + 1, self.skipped.stop):
             return {}
         metrics = {"step_gain": float(self.gains[-1, 1]), "step_price": self.options.price}
@@ -183,7 +178,7 @@ class Plateau(TrainingModule):
 
 
 def last_milestone(run: Run, before: int) -> int:
-    """Returns the last step at which modules or backbone do something once, before a step."""
+    """Returns the last milestone of modules or backbone before a step."""
     steps = list(run.backbone.milestones()) if isinstance(run.backbone, WithMilestones) else []
     steps += [step for module in run.modules.values() for step in module.milestones()]
     return max((step for step in steps if step < before), default=0)

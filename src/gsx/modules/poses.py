@@ -81,9 +81,7 @@ class Poses(Correction):
         if self.matrices is None:
             return views
         pairs = zip(views, self.matrices, strict=True)
-        return self.cache.get(
-            views, lambda: [change_pose(view, with_pose(view.camera, matrix)) for view, matrix in pairs]
-        )
+        return self.cache.get(views, lambda: [change_pose(view, with_pose(view.camera, m)) for view, m in pairs])
 
     # -- estimates -----------------------------------------------------------------------------------------------------
 

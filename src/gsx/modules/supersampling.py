@@ -1,7 +1,7 @@
-"""Renders finer than photos, reduced by the filter that made the photos: the loss knows how a pixel came about.
+"""Supersampling: renders finer than photos, reduced by the photos' filter before the loss.
 
-Photos of neighbouring cameras sample a scene between each other's pixels. A loss between photos and reduced renders
-makes use of that (NeRF-SR, Wang et al. 2022; SRGS, Feng et al. 2024).
+Photos of neighbouring cameras sample a scene between each other's pixels; a loss on reduced renders uses that.
+Sources: NeRF-SR (Wang et al. 2022), SRGS (Feng et al. 2024).
 """
 
 from dataclasses import dataclass
@@ -16,13 +16,13 @@ class SupersamplingOptions:
     """Options; values in conf/module/supersampling.yaml."""
 
     factor: Annotated[int, Range(1, 16)] = 1
-    """Renders are so many times as fine as photos; evaluation, viewer and reports do the same; published: 1."""
+    """Resolution of renders relative to photos, also in evaluation, viewer and reports; published: 1."""
     start: Share = 0.0
-    """Share of the steps before that."""
+    """Share of the steps at the photos' own resolution before that."""
 
     def __post_init__(self) -> None:
         if self.start == 1:
-            raise ValueError("training.supersampling.start is 1.0; give a share of the steps below 1")
+            raise ValueError("training.supersampling.start is 1.0; set a share of the steps below 1")
 
 
 class Supersampling(TrainingModule):
@@ -36,7 +36,7 @@ class Supersampling(TrainingModule):
         """Last step that renders at the photos' own resolution."""
 
     def raster_scale(self, step: int) -> int:
-        """Returns how many times as fine as photos the renders of a step are."""
+        """Returns the resolution of the renders of a step relative to photos."""
         return self.options.factor if step > self.last_plain else 1
 
     def milestones(self) -> list[int]:

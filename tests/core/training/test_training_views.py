@@ -156,5 +156,5 @@ def test_of_1_nothing_changes(tmp_path: Path) -> None:
 
 
 def test_what_is_no_power_of_two_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"training.coarse_to_fine.factor is 3; give a power of two, for example 2"):
+    with pytest.raises(ConfigError, match=r"training.coarse_to_fine.factor is 3; set a power of two, for example 2"):
         tiny_settings(tmp_path, "training.coarse_to_fine.factor=3")

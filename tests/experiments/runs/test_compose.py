@@ -232,7 +232,7 @@ def test_common_scene_defaults_agree_with_the_schema() -> None:
         (["seed=-1"], "seed is -1; give a number from 0"),
         (["seed=9223372036854775808"], "seed"),
         (["warm_start_at=[0]"], "warm_start_at is \\[0\\]; give a number from 1"),
-        (["training.supersampling.start=1"], "training.supersampling.start is 1.0; give a share of the steps"),
+        (["training.supersampling.start=1"], "training.supersampling.start is 1.0; set a share of the steps"),
         (["backbone=scaffold", "preset=zoom"], "Unknown key 'backbone.rates.shortened'"),
         (["rasterizer.dilation=0"], "rasterizer.dilation is 0"),
         (["output=${oc.env:GSX_UNSET_VARIABLE}/x"], "cannot be resolved"),
