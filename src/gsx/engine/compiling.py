@@ -153,18 +153,13 @@ def sizes_free(compiled: Callable[..., Any], varying: Varying) -> Callable[..., 
     return call
 
 
-@functools.lru_cache
-def with_any_sizes(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compiles `function` once for tensors of all sizes."""
-    return torch.compile(function, dynamic=True)
-
-
 def fused(function: Callable[..., Result]) -> Callable[..., Result]:
-    """Compiles `function` of tensors into few kernels on a GPU, where launches cost; a CPU runs it uncompiled."""
+    """Compiles `function` of tensors of any size into few kernels on a GPU; a CPU runs it uncompiled."""
+    compiled = functools.cache(lambda: torch.compile(function, dynamic=True))  # importing the compiler takes a second
 
     @functools.wraps(function)
     def call(*arguments: Any) -> Result:
         device = arguments[0].device.type
-        return (with_any_sizes(function) if device != "cpu" and available(device) else function)(*arguments)
+        return (compiled() if device != "cpu" and available(device) else function)(*arguments)
 
     return call

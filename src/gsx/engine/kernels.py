@@ -37,6 +37,12 @@ Axis: TypeAlias = Float[Tensor, "P *one"]
 """One coordinate of a tile's pixels, px from its middle."""
 Light: TypeAlias = Float[Tensor, "B P *L"]
 """A number at every pixel of each block."""
+Lights: TypeAlias = list[Light]
+"""One for each channel, or entry."""
+Slopes: TypeAlias = Float[Tensor, "B K P *L"]
+"""A number of every entry at every pixel."""
+Axes: TypeAlias = Float[Tensor, "3 P *one"]
+"""x^2, x y, y^2 of a tile's pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +152,7 @@ def blended(
     return t, total
 
 
-def blend(rows: Rows, x: Axis, y: Axis, before: Light, after: Light, accumulated: list[Light], rules: Rules) -> None:
+def blend(rows: Rows, x: Axis, y: Axis, before: Light, after: Light, accumulated: Lights, rules: Rules) -> None:
     """Blends one block of every group into `accumulated`: the channels and, last, the coverage.
 
     `before` is the transmittance in front of the block; `after` receives that behind it.
@@ -185,8 +191,8 @@ def weighted_picture(lights: Sequence[Tensor], gradient: Sequence[Tensor], befor
 
 
 def slopes(
-    rows: Rows, x: Axis, y: Axis, before: Light, behind: Light, gradient: list[Light], rules: Rules
-) -> tuple[list[Light], list[Light], Light]:
+    rows: Rows, x: Axis, y: Axis, before: Light, behind: Light, gradient: Lights, rules: Rules
+) -> tuple[Lights, Lights, Light]:
     """Returns (d loss / d ln alpha of each entry, its blending weight, `behind` moved in front of the block).
 
     `behind` is the gradient-weighted picture behind the block (`weighted_picture`); with it the slope is weight
@@ -213,14 +219,7 @@ def slopes(
 
 
 def sums_of(
-    rows: Rows,
-    slope: Float[Tensor, "B K P *L"],
-    weight: Float[Tensor, "B K P *L"],
-    x: Axis,
-    y: Axis,
-    products: Float[Tensor, "3 P *one"],
-    gradient: list[Light],
-    rules: Rules,
+    rows: Rows, slope: Slopes, weight: Slopes, x: Axis, y: Axis, products: Axes, gradient: Lights, rules: Rules
 ) -> Float[Tensor, "B K V *L"]:
     """Sums slope d and weight of every entry over a tile's pixels.
 
@@ -238,10 +237,10 @@ def gradients(
     rows: Rows,
     x: Axis,
     y: Axis,
-    products: Float[Tensor, "3 P *one"],
+    products: Axes,
     before: Light,
     behind: Light,
-    gradient: list[Light],
+    gradient: Lights,
     out: Float[Tensor, "B K *L V"],
     rules: Rules,
 ) -> None:
@@ -256,7 +255,7 @@ def gradients(
     out.copy_(entry_gradients(rows, sums_of(rows, slope, weight, x, y, products, gradient, rules), rules))
 
 
-def absolute_moments(rows: Rows, slope: Float[Tensor, "B K P *L"], x: Axis, y: Axis) -> list[Float[Tensor, "B K *L"]]:
+def absolute_moments(rows: Rows, slope: Slopes, x: Axis, y: Axis) -> list[Float[Tensor, "B K *L"]]:
     """Sums |d loss / d mean| over pixels, per axis: minus the slope of ln alpha along x and y."""
     u0, u1, k0, u2, k1 = (column[:, :, None] for column in rows[:, :, :5].unbind(2))
     s, r = u0 * x + u1 * y + k0, u2 * y + k1

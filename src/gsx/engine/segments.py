@@ -41,6 +41,10 @@ Light: TypeAlias = Float[Tensor, "S P"]
 """A number at every pixel of each block."""
 Blocks: TypeAlias = Int[Tensor, "S"]
 """A number of each block."""
+Gradient: TypeAlias = Float[Tensor, "T C_1 P"]
+"""Gradient of each tile's channels and coverage."""
+Slopes: TypeAlias = Float[Tensor, "S 2_K P"]
+"""Slopes of all entries, then their weights."""
 
 
 # -- loops ---------------------------------------------------------------------------------------------------------
@@ -51,23 +55,14 @@ def light(rows: Rows, before: Light, x: Tensor, y: Tensor, rules: Rules) -> list
     return blended(rows, x, y, before, [0.0] * (rules.channels + 1), rules)[1]
 
 
-def block_picture(
-    lights: list[Light], before: Light, tiles: Blocks, gradient: Float[Tensor, "T C_1 P"], rules: Rules
-) -> Light:
+def block_picture(lights: list[Light], before: Light, tiles: Blocks, gradient: Gradient, rules: Rules) -> Light:
     """Returns the gradient-weighted picture of each block alone."""
     return weighted_picture(lights, gradient[tiles].unbind(1), before, rules)
 
 
 def entry_slopes(
-    rows: Rows,
-    before: Light,
-    behind: Light,
-    tiles: Blocks,
-    gradient: Float[Tensor, "T C_1 P"],
-    x: Tensor,
-    y: Tensor,
-    rules: Rules,
-) -> Float[Tensor, "S 2_K P"]:
+    rows: Rows, before: Light, behind: Light, tiles: Blocks, gradient: Gradient, x: Tensor, y: Tensor, rules: Rules
+) -> Slopes:
     """Returns `slopes` of every entry at every pixel, then the weights.
 
     In one tensor: for few entries the compiler would otherwise compute each of them from the rows again.
@@ -77,14 +72,7 @@ def entry_slopes(
 
 
 def entry_sums(
-    rows: Rows,
-    found: Float[Tensor, "S 2_K P"],
-    tiles: Blocks,
-    gradient: Float[Tensor, "T C_1 P"],
-    x: Tensor,
-    y: Tensor,
-    products: Float[Tensor, "3 P"],
-    rules: Rules,
+    rows: Rows, found: Slopes, tiles: Blocks, gradient: Gradient, x: Tensor, y: Tensor, products: Tensor, rules: Rules
 ) -> Float[Tensor, "S K V"]:
     """Returns `sums_of` the slopes and weights in `found`; a loop of its own: sums over pixels need other threads."""
     slope, weight = found.chunk(2, 1)
@@ -270,16 +258,12 @@ def blend_segments(job: SegmentJob, table: Float[Tensor, "M_1 F"]) -> tuple[Floa
     passed = compiled_loop(fade, rules)(rows, job.x, job.y).to(job.precision.accumulation)
     before = before_blocks(passed, segments)
     lights = compiled_loop(light, rules)(rows, before, job.x, job.y)
-    return torch.stack([sum_by_tile(one, segments) for one in lights], 2), Kept(rows, passed, before, lights)
+    blocks = torch.arange(len(rows), device=rows.device)
+    sums = [bag_sums(one, blocks, segments.edges) for one in lights]
+    return torch.stack(sums, 2), Kept(rows, passed, before, lights)
 
 
-def sum_by_tile(values: Light, segments: Segments) -> Float[Tensor, "T P"]:
-    """Sums over the blocks of each tile."""
-    blocks = torch.arange(len(values), device=values.device)
-    return bag_sums(values, blocks, segments.edges)
-
-
-def segment_moments(job: SegmentJob, kept: Kept, gradient: Float[Tensor, "T C_1 P"]) -> Float[Tensor, "S K V"]:
+def segment_moments(job: SegmentJob, kept: Kept, gradient: Gradient) -> Float[Tensor, "S K V"]:
     """Returns the moments of every entry, `batch` blocks at a time."""
     segments, rules = job.segments, job.rules
     own = compiled_loop(block_picture, rules)(kept.lights, kept.before, segments.tiles, gradient)

@@ -10,7 +10,6 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -49,7 +48,7 @@ def watch() -> None:
     while True:
         time.sleep(EVERY)
         after, end = waits(), time.perf_counter()
-        waiting = waited_between(before, after) / (end - start)
+        waiting = sum(after[thread] - before[thread] for thread in before.keys() & after.keys()) / 1e9 / (end - start)
         before, start = after, end
         if idle is None and waiting > MANY:
             idle = start_idle_threads()
@@ -68,11 +67,6 @@ def waits() -> dict[str, int]:
         with suppress(OSError, IndexError, ValueError):  # a thread may end meanwhile
             times[file.parent.name] = int(file.read_text().split()[1])
     return times
-
-
-def waited_between(before: Mapping[str, int], after: Mapping[str, int]) -> float:
-    """Returns the time that all threads together have waited for a core in between, seconds."""
-    return sum(after[thread] - before[thread] for thread in before.keys() & after.keys()) / 1e9
 
 
 def teams_needed() -> int:

@@ -8,10 +8,11 @@ directions that images do not determine (a turn from a move, in front of a dista
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import grid_sample
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.masks import grown
@@ -24,11 +25,17 @@ from gsx.modules.image_shift import (
     NEGLIGIBLE,
     Grey,
     Mask,
+    halve,
     median_residual,
     robust_weights,
     slope,
     smoothed_grey,
 )
+
+Points: TypeAlias = Float[Tensor, "3 P"]
+Pixels: TypeAlias = Float[Tensor, "2 P"]
+"""Positions, px."""
+Numbers: TypeAlias = Float[Tensor, "P"]
 
 ROUNDS, MIN_STEP = 10, 0.02
 """Most iterations at each size; step at which they end, px."""
@@ -46,7 +53,7 @@ class Motion:
     move: Float[Tensor, "3"]
     """Scene units."""
 
-    def apply(self, points: Float[Tensor, "3 P"]) -> Float[Tensor, "3 P"]:
+    def apply(self, points: Points) -> Points:
         """Returns points of the first frame in the second."""
         return self.rotation @ points + self.move[:, None]
 
@@ -105,7 +112,7 @@ class Reference:
     prior_weight: float
     """See `estimate_camera`. The same at half the size: a quarter of the pixels, half of the px."""
 
-    def points(self) -> Float[Tensor, "3 P"]:
+    def points(self) -> Points:
         """Returns the points of pixels inside, in the camera's frame."""
         camera, (y, x) = self.camera, self.inside.nonzero(as_tuple=True)
         across, down = (x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy
@@ -114,11 +121,9 @@ class Reference:
     def halved(self) -> "Reference":
         """Returns the render at half the size; a pixel counts if all four do."""
         width, height = (side // 2 for side in self.camera.size)
-        image, depth, inside = (
-            avg_pool2d(values[None].double(), 2)[0] for values in (self.image, self.depth, self.inside)
-        )
         camera = self.camera.crop(0, 0, 2 * width, 2 * height).resize(width, height)
-        mask = None if self.mask is None else avg_pool2d(self.mask[None].double(), 2)[0] == 1
+        image, depth, inside = (halve(values) for values in (self.image, self.depth, self.inside))
+        mask = None if self.mask is None else halve(self.mask) == 1
         return replace(self, camera=camera, image=image, depth=depth, inside=inside == 1, mask=mask)
 
     @cached_property
@@ -126,7 +131,7 @@ class Reference:
         """1 near pixels of the photo that do not count, else 0; None: all count."""
         return None if self.mask is None else grown(~self.mask[None], BORDER).double()
 
-    def project(self, points: Float[Tensor, "3 P"]) -> tuple[Float[Tensor, "2 P"], Bool[Tensor, "P"]]:
+    def project(self, points: Points) -> tuple[Pixels, Bool[Tensor, "P"]]:
         """Projects points; returns (px, which lie in front of the camera, away from borders and excluded pixels)."""
         camera, (x, y, z) = self.camera, points
         deep = z.clamp_min(max(camera.near, 1e-9))
@@ -175,7 +180,7 @@ def estimate_motion(reference: Reference, photo: Grey) -> Motion | None:
     """Estimates the motion to the photo's pose, coarse to fine; None where pixels do not determine it."""
     start = None
     if min(photo.shape) >= 2 * MIN_SIDE:
-        start = estimate_motion(reference.halved(), avg_pool2d(photo[None], 2)[0])
+        start = estimate_motion(reference.halved(), halve(photo))
     return refine(reference, photo, start or STILL)
 
 
@@ -209,22 +214,15 @@ def refine(reference: Reference, photo: Grey, motion: Motion) -> Motion | None:
     return motion
 
 
-def sample_image(
-    images: Float[Tensor, "C H W"], pixels: Float[Tensor, "2 P"], mode: str = "bicubic"
-) -> Float[Tensor, "C P"]:
+def sample_image(images: Float[Tensor, "C H W"], pixels: Pixels, mode: str = "bicubic") -> Float[Tensor, "C P"]:
     """Returns values of images at positions, px."""
     places = 2 * pixels.T / pixels.new_tensor([images.shape[2], images.shape[1]]) - 1
     values = grid_sample(images[None], places[None, None], mode=mode, padding_mode="border", align_corners=False)
     return values[0, :, 0]
 
 
-def motion_slopes(
-    camera: Camera, points: Float[Tensor, "3 P"], right: Float[Tensor, "P"], down: Float[Tensor, "P"]
-) -> Float[Tensor, "6 P"]:
-    """Returns the change of values with a turn, per rad, and a move, per scene unit, of the points that show them.
-
-    `right` and `down`: slopes of the values, per px.
-    """
+def motion_slopes(camera: Camera, points: Points, right: Numbers, down: Numbers) -> Float[Tensor, "6 P"]:
+    """Returns slopes of values by a turn, per rad, and a move, per scene unit, of their points, from those per px."""
     x, y, z = points
     across, along = right * camera.fx / z, down * camera.fy / z
     by_point = torch.stack([across, along, -(across * x + along * y) / z])
@@ -232,11 +230,7 @@ def motion_slopes(
 
 
 def fit_with_prior(
-    columns: Float[Tensor, "8 P"],
-    target: Float[Tensor, "P"],
-    residual: Float[Tensor, "P"],
-    off: Float[Tensor, "6"],
-    prior_weight: float,
+    columns: Float[Tensor, "8 P"], target: Numbers, residual: Numbers, off: Float[Tensor, "6"], prior_weight: float
 ) -> Float[Tensor, "8"]:
     """Returns coefficients of columns that fit the target, robust by the last residuals, with a prior.
 

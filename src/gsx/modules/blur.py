@@ -62,11 +62,6 @@ class Blur(Correction):
         self.movements: dict[str, tuple[float, float]] = {}
         """Movement to the right and down, shares of the frame's sides, by the name of a blurred photo."""
 
-    @property
-    def active(self) -> bool:
-        """True if photos are blurred."""
-        return bool(self.movements)
-
     def restarted(self, context: ModuleContext) -> "Blur":
         """Returns a module with the present movements that estimates no others."""
         module = Blur(BlurOptions(), context)

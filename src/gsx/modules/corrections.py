@@ -69,8 +69,8 @@ class Correction(TrainingModule):
 
     @property
     def active(self) -> bool:
-        """True if photos are corrected now."""
-        raise NotImplementedError
+        """True if photos are corrected now: there is a state to save."""
+        return bool(self.state_dict())
 
     def estimate(self, run: Run, step: int) -> dict[str, float]:
         """Tests and estimates the correction before a step; returns metrics for its line."""

@@ -69,11 +69,6 @@ class Distractors(Correction):
         """Pixels of distractors, by photo in order; None: no photo is masked."""
         self.cache = ViewCache()
 
-    @property
-    def active(self) -> bool:
-        """True if photos are masked."""
-        return self.masks is not None
-
     def transform_views(self, views: Sequence[View], step: int | None) -> Sequence[View]:
         """Returns the views without their distractors."""
         if self.masks is None:

@@ -136,11 +136,6 @@ class Exposure(Correction):
         self.rendered: set[int] = set()
         """Photos of the step under way."""
 
-    @property
-    def active(self) -> bool:
-        """True if photos have exposures."""
-        return self.matrices is not None
-
     def due(self, step: int) -> bool:
         """Checks if exposures are estimated before a step: with grids only once, since gains know less."""
         return self.grids is None and super().due(step)

@@ -54,8 +54,7 @@ def coarse_to_fine(source: Grey, target: Grey, inside: Mask) -> Shift | None:
     """Estimates the shift at half the size first, where images are large enough."""
     start = None
     if min(source.shape) >= 2 * MIN_SIDE:
-        half = [avg_pool2d(values[None].double(), 2)[0] for values in (source, target, inside)]
-        start = coarse_to_fine(half[0], half[1], half[2] == 1)
+        start = coarse_to_fine(halve(source), halve(target), halve(inside) == 1)
     return refine(source, target, inside, source.new_zeros(2) if start is None else 2 * start)
 
 
@@ -108,6 +107,11 @@ def structured(columns: Float[Tensor, "C P"]) -> Bool[Tensor, "P"]:
 def smoothed_grey(image: Float[Tensor, "3 H W"]) -> Grey:
     """Returns the mean of the channels, smoothed over 3 x 3 px so that slopes hold over a pixel or two; float64."""
     return avg_pool2d(image.double().mean(0)[None], 3, stride=1, padding=1, count_include_pad=False)[0]
+
+
+def halve(values: Float[Tensor, "H W"] | Mask) -> Grey:
+    """Returns means of 2 x 2 pixels, float64."""
+    return avg_pool2d(values[None].double(), 2)[0]
 
 
 def translate(image: Grey, shift: Shift) -> Grey:

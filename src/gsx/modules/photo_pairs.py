@@ -13,8 +13,11 @@ from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.modules.derived_views import reduce_view
 
-Pair: TypeAlias = tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"], Bool[Tensor, "H W"] | None]
-"""Render, photo, mask of the pixels that count (None: all)."""
+Image: TypeAlias = Float[Tensor, "3 H W"]
+Mask: TypeAlias = Bool[Tensor, "H W"]
+"""Pixels that count."""
+Pair: TypeAlias = tuple[Image, Image, Mask | None]
+"""Render, photo, mask (None: all pixels count)."""
 REDUCTION = 2
 """Reduction of the views of estimates, which then take a third of the time."""
 DARK, LIGHT = 0.05, 0.95
@@ -31,17 +34,13 @@ def render_reduced(run: Run, view: View, depth: bool = True, min_pixels: int = 0
     return small, render(run, small.camera, supersample=1, depth=depth)
 
 
-def usable_pixels(
-    image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"], mask: Bool[Tensor, "H W"] | None
-) -> Bool[Tensor, "H W"]:
+def usable_pixels(image: Image, photo: Image, mask: Mask | None) -> Mask:
     """Returns the pixels that count and are neither dark nor light, in render and photo."""
     usable = ((image > DARK) & (image < LIGHT) & (photo > DARK) & (photo < LIGHT)).all(0)
     return usable if mask is None else usable & mask.to(usable.device)
 
 
-def log_gains(
-    image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"], mask: Bool[Tensor, "H W"] | None = None
-) -> Float[Tensor, "3"]:
+def log_gains(image: Image, photo: Image, mask: Mask | None = None) -> Float[Tensor, "3"]:
     """Returns the median of log(photo / image) of each channel, over usable pixels; nan where they are too few."""
     usable = usable_pixels(image, photo, mask)
     if int(usable.sum()) < MIN_PIXELS:
@@ -49,16 +48,12 @@ def log_gains(
     return (photo[:, usable] / image[:, usable]).log().double().median(dim=1).values.float().cpu()
 
 
-def gains(
-    image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"], mask: Bool[Tensor, "H W"] | None
-) -> Float[Tensor, "3"]:
+def gains(image: Image, photo: Image, mask: Mask | None) -> Float[Tensor, "3"]:
     """Returns the brightness of a photo relative to its render, by channel; 1 where pixels are too few."""
     return log_gains(image, photo, mask).nan_to_num(0.0).exp()
 
 
-def match_brightness(
-    image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"], mask: Bool[Tensor, "H W"] | None
-) -> Float[Tensor, "3 H W"]:
+def match_brightness(image: Image, photo: Image, mask: Mask | None) -> Image:
     """Returns a render scaled to the brightness of its photo, by channel, and clamped."""
     return (gains(image, photo, mask)[:, None, None] * image).clamp(0, 1)
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.ranges import Range
-from gsx.core.shapes import Bool, Float
+from gsx.core.shapes import Float
 from gsx.core.training.module import ModuleContext
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -28,7 +28,7 @@ from gsx.modules.alignment import Motion, estimate_camera, median_depth, motion_
 from gsx.modules.corrections import Correction, CorrectionOptions, Times, ViewCache, ViewCount, log_test, sample
 from gsx.modules.derived_views import change_pose, reduce_view
 from gsx.modules.image_shift import estimate_shift
-from gsx.modules.photo_pairs import REDUCTION, render_reduced, shared_spread
+from gsx.modules.photo_pairs import REDUCTION, Image, Mask, render_reduced, shared_spread
 
 logger = logging.getLogger(__name__)
 
@@ -70,11 +70,6 @@ class Poses(Correction):
         self.error = math.nan
         """Expected error of the scene's poses at the last correction, px, standard deviation."""
         self.cache = ViewCache()
-
-    @property
-    def active(self) -> bool:
-        """True if poses are corrected."""
-        return self.matrices is not None
 
     def transform_views(self, views: Sequence[View], step: int | None) -> Sequence[View]:
         """Returns the views with corrected poses."""
@@ -182,7 +177,7 @@ class Poses(Correction):
             )
 
 
-def photo_pairs(run: Run, views: Sequence[View]) -> Iterator[tuple[Tensor, Tensor, Tensor | None, float]]:
+def photo_pairs(run: Run, views: Sequence[View]) -> Iterator[tuple[Image, Image, Mask | None, float]]:
     """Yields (render, photo, pixels that count, px of the photo per pixel) of reduced views."""
     for view in views:
         run.raise_if_stopping()
@@ -194,9 +189,7 @@ def photo_pairs(run: Run, views: Sequence[View]) -> Iterator[tuple[Tensor, Tenso
 # -- test --------------------------------------------------------------------------------------------------------------
 
 
-def half_shifts(
-    pairs: Iterable[tuple[Tensor, Tensor, Bool[Tensor, "H W"] | None, float]],
-) -> Float[Tensor, "N 2 2"]:
+def half_shifts(pairs: Iterable[tuple[Image, Image, Mask | None, float]]) -> Float[Tensor, "N 2 2"]:
     """Returns the shifts of both halves of each photo from its render, to the right and down, px; nan: unknown."""
     shifts = [[half_shift(*pair, right) for right in (False, True)] for pair in pairs]
     return torch.tensor(shifts, dtype=torch.float64)
@@ -211,13 +204,7 @@ def usual_shift(halves: Float[Tensor, "N 2 2"]) -> float:
     return math.sqrt(max(0.0, float((left * right).median())) / MEDIAN_SQUARE)
 
 
-def half_shift(
-    image: Float[Tensor, "3 H W"],
-    photo: Float[Tensor, "3 H W"],
-    mask: Bool[Tensor, "H W"] | None,
-    px: float,
-    right: bool,
-) -> tuple[float, float]:
+def half_shift(image: Image, photo: Image, mask: Mask | None, px: float, right: bool) -> tuple[float, float]:
     """Returns the shift to the right and down of half a photo from half its render; px: of the photo per pixel."""
     middle = image.shape[2] // 2
     part = slice(middle, None) if right else slice(middle)
