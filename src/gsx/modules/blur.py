@@ -149,9 +149,7 @@ class Blur(Correction):
 
 def reduced_to(view: View, run: Run, pixels: int) -> View:
     """Returns the view halved until it has at most `pixels` pixels, or cannot be halved."""
-    while view.camera.width * view.camera.height > pixels:
-        halved = reduce_view(view, run.scene.reduction, 2)
-        if halved is view:
-            break
-        view = halved
-    return view
+    if view.camera.width * view.camera.height <= pixels:
+        return view
+    halved = reduce_view(view, run.scene.reduction, 2)
+    return view if halved is view else reduced_to(halved, run, pixels)
