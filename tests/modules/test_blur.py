@@ -19,7 +19,7 @@ from gsx.core.training.run import Run
 from gsx.core.training.trainer import view_loss
 from gsx.experiments.runs.degraded import pair_of
 from gsx.experiments.runs.execute import execute
-from gsx.experiments.runs.halves import made
+from gsx.experiments.runs.halves import render_halves
 from gsx.experiments.runs.open import open_run
 from gsx.modules.blur import Blur, BlurOptions
 from gsx.modules.motion_blur import Movement, motion_blurred
@@ -177,7 +177,7 @@ def test_halves_take_the_movements_that_were_found(moved: tuple[Run, Path]) -> N
         run, _ = open_run(moved[1], plugins())
         name = next(iter(run.modules["blur"].movements))
         run.modules["blur"].movements = run.modules["blur"].movements if known else {}
-        shown = made(run, lambda scene, steps, generator, resolution, own=run.backbone: own, 1, 0)
+        shown = render_halves(run, lambda own=run.backbone, **changes: own, 1, 0)
         pictures.append(next(shown[n] for n, view in enumerate(run.train_views) if view.name == name))
     assert fineness(pictures[0]).min() < 0.9 * fineness(pictures[1]).min()
 
