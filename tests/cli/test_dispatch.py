@@ -488,7 +488,6 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     ),
     "frames of no orbit": (lambda t: ["render", str(t / "run"), "--frames", "3"], "go with --orbit FILE"),
     "axes of no spz": (lambda t: ["export", str(t / "run"), str(t / "x.ply"), "--axes", "rdf"], "are for .spz files"),
-    "trade": (lambda t: ["trade", "training"], "whose page plots quality against cost"),
     "a choice that is there twice": (
         lambda t: words(t / "run", "iterations=1", "augmenter=[upscale,bootstrap,upscale]"),
         "augmenter=[upscale,bootstrap,upscale] names upscale twice: leave one out",

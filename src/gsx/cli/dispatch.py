@@ -45,10 +45,6 @@ Every setting is a word KEY=VALUE:
 
 gsx VERB --help explains a command. Tab completion: eval "$(gsx -sc install=bash)". In zsh quote brackets.
 """
-TRADE_MOVED = (
-    "gsx trade was removed. Compare settings with `gsx -m KEY=A,B ...`, whose page plots quality against cost, or "
-    "measure the rasterizer with `python benchmarks/trades.py --what rasterizer` (docs/how-to/choose-settings.md)"
-)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -104,8 +100,6 @@ def dispatch(arguments: list[str]) -> int:
         return TRAIN(arguments)
     if first in VERBS:
         return VERBS[first](arguments[1:])
-    if first == "trade":
-        raise ConfigError(TRADE_MOVED)
     if expand_home(first).exists():
         return TRAIN_FOLDER(arguments)
     raise ConfigError(f"Unknown command or path '{first}'.{nearest(first, VERBS)} See gsx --help")

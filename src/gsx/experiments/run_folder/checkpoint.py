@@ -17,6 +17,7 @@ from gsx.core.errors import CheckpointError, InputError
 from gsx.core.files import read_json, refuse_lfs_pointer, replace_file, sidecars, step_of, write_json
 from gsx.core.training.parameter_table import restore_table, table_tensors
 from gsx.core.training.run import Run
+from gsx.experiments.run_folder.shapes import Shape, fits, is_number
 
 logger = logging.getLogger(__name__)
 
@@ -24,6 +25,13 @@ SCHEMA = 1
 GENERATOR = "run.generator"
 LONGEST = 1e12
 """Upper limit of training time in seconds."""
+SIDECAR: Shape = {
+    "step": int,
+    "seconds": is_number,
+    "views": {"train": [str], "test": [str]},
+    "sampler": [int],
+    "orders?": int,
+}
 
 
 def save(run: Run) -> Path:
@@ -110,19 +118,9 @@ def unusable(path: Path, problem: str) -> CheckpointError:
 
 def is_valid(meta: dict[str, Any], step: int) -> bool:
     """Return True if a sidecar has the form that `write` gives that of a step."""
-    views, order = meta.get("views"), meta.get("sampler")
-    if not (isinstance(views, dict) and isinstance(order, list)):
+    if not fits(meta, SIDECAR) or meta["step"] != step or not 0 <= meta["seconds"] < LONGEST:
         return False
-    named = all(is_list_of(str, views.get(part)) for part in ("train", "test"))
-    seconds, orders = meta.get("seconds"), meta.get("orders", 0)
-    timed = isinstance(seconds, int | float) and 0 <= seconds < LONGEST
-    numbers = meta.get("step") == step and timed and isinstance(orders, int) and orders >= 0
-    return named and numbers and is_list_of(int, order) and all(0 <= view < len(views["train"]) for view in order)
-
-
-def is_list_of(kind: type, value: Any) -> bool:
-    """Return True for a list with values of that type only."""
-    return isinstance(value, list) and all(isinstance(one, kind) for one in value)
+    return meta.get("orders", 0) >= 0 and all(0 <= view < len(meta["views"]["train"]) for view in meta["sampler"])
 
 
 def newest(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor], list[Path]]:

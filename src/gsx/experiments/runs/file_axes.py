@@ -16,7 +16,6 @@ from gsx.core.shapes import Float
 from gsx.core.training.render import render_gaussians
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import (
-    MOST_SPLATS,
     MOST_VIEWS,
     distance_from_points,
     evident_points,
@@ -25,6 +24,7 @@ from gsx.experiments.runs.start_file import (
     reaching,
     spread,
     start_doubts,
+    thinned,
 )
 from gsx.formats.axes import flipped
 from gsx.formats.axis_names import FIXED, SPECIFIED, TRAINED
@@ -98,13 +98,12 @@ def start_in_scene(
 
 def fit(gaussians: Gaussians, scene: Scene) -> Fit:
     """Measure the fit of Gaussians of a file to a scene."""
-    some = Gaussians(**{name: spread(value, MOST_SPLATS) for name, value in vars(gaussians).items()})
+    some = thinned(gaussians)
     some = around(some, origin_of_file(some, scene))
-    views = [*scene.train, *scene.test]
-    cameras = [view.camera for view in views[:: -(-len(views) // MOST_VIEWS)]]
-    shares = [float(reaching(some, camera, 0).double().mean()) for camera in cameras]
+    views = spread([*scene.train, *scene.test], MOST_VIEWS)
+    shares = [float(reaching(some, view.camera, 0).double().mean()) for view in views]
     places = evident_points(scene.points)
-    distance = distance_from_points(some.means, places) if len(places) else float("nan")
+    distance = distance_from_points(some.means, places) if len(places) else nan
     return Fit(in_view=fmean(shares), distance=distance)
 
 
@@ -131,10 +130,8 @@ def in_view(fits: dict[str, Fit]) -> bool:
 def likeness(gaussians: Gaussians, scene: Scene) -> float:
     """Return the mean PSNR of thumbnails of a file's Gaussians against those of photos, dB."""
     gaussians = around(gaussians, origin_of_file(gaussians, scene))
-    views = [*scene.train, *scene.test]
-    return fmean(
-        thumbnail_psnr(gaussians, view, scene.background) for view in views[:: -(-len(views) // MOST_THUMBNAILS)]
-    )
+    views = spread([*scene.train, *scene.test], MOST_THUMBNAILS)
+    return fmean(thumbnail_psnr(gaussians, view, scene.background) for view in views)
 
 
 def thumbnail_psnr(gaussians: Gaussians, view: View, background: Float[Tensor, "3"]) -> float:

@@ -41,20 +41,12 @@ GIF_FASTEST = 50
 """Frames per second of a GIF: delays are whole hundredths of a second, and viewers slow down below two of them."""
 
 
-@dataclass(frozen=True)
-class Encoding:
-    """Options of FFmpeg for an animation."""
-
-    codec: str
-    quality: dict[str, str]
-    container: dict[str, str]
-
-
 GIF = ".gif"
 ENCODINGS = {
-    ".webp": Encoding("libwebp_anim", {"quality": "85"}, {"loop": "0"}),
-    ".mp4": Encoding("libx264", {"crf": "18"}, {"movflags": "+faststart"}),  # H.264, with its index first
+    ".webp": ("libwebp_anim", {"quality": "85"}, {"loop": "0"}),
+    ".mp4": ("libx264", {"crf": "18"}, {"movflags": "+faststart"}),  # H.264, with its index first
 }
+"""Codec of FFmpeg, its options, and those of the container, by suffix."""
 SUFFIXES = (GIF, *ENCODINGS)
 
 
@@ -228,7 +220,7 @@ def write_animation(path: Path, frames: Iterable[Float[Tensor, "3 H W"]], fps: f
         if suffix == GIF:
             write_gif(partial, checked(path, frames), fps)
         else:
-            encode(ENCODINGS[suffix], partial, checked(path, frames), fps)
+            encode(suffix, partial, checked(path, frames), fps)
 
 
 def import_av(path: Path) -> Any:
@@ -280,15 +272,15 @@ def write_gif(path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) 
             output.close()
 
 
-def encode(encoding: Encoding, path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) -> None:
+def encode(suffix: str, path: Path, frames: Iterator[UInt8[Tensor, "H W 3"]], fps: float) -> None:
     """Encode frames with PyAV. An odd last row or column is dropped: 4:2:0 colour needs even sizes."""
-    av = import_av(path)
+    av, (codec, quality, container) = import_av(path), ENCODINGS[suffix]
     first = next(frames)
     height, width = (size // 2 * 2 for size in first.shape[:2])
     if not (height and width):
         raise InputError(f"{path}: frames of {first.shape[1]}x{first.shape[0]} px are too small for that; give a .gif")
-    with av.open(str(path), mode="w", options=encoding.container) as output:
-        stream = output.add_stream(encoding.codec, rate=Fraction(fps).limit_denominator(1000), options=encoding.quality)
+    with av.open(str(path), mode="w", options=container) as output:
+        stream = output.add_stream(codec, rate=Fraction(fps).limit_denominator(1000), options=quality)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         for frame in chain([first], frames):
             picture = av.VideoFrame.from_ndarray(frame[:height, :width].contiguous().numpy(), format="rgb24")

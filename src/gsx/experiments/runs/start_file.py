@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ from gsx.formats.splat_files import SplatContent, compensated, is_linear, read_s
 from gsx.scenes.points import GREY
 
 logger = logging.getLogger(__name__)
+Rows = TypeVar("Rows", Tensor, Sequence[Any])
 
 OWN_KEYS = ("backbone", "augmenter", "init", "iterations", "variant", "preset", "budget", "experiment")
 """Keys that `gsx eval FILE` sets or that only training uses: they cannot be overridden."""
@@ -208,9 +209,9 @@ def reaching(gaussians: Gaussians, camera: Camera, sigmas: float) -> Bool[Tensor
 
 def in_view_doubts(gaussians: Gaussians, cameras: Sequence[Camera], kind: str) -> Iterator[str]:
     """Yield a doubt if hardly any splat has its mean in view of some camera."""
-    some = Gaussians(**{name: spread(value, MOST_SPLATS) for name, value in vars(gaussians).items()})
+    some = thinned(gaussians)
     in_view = torch.zeros(len(some.means), dtype=torch.bool, device=some.means.device)
-    for camera in cameras[:: max(1, -(-len(cameras) // MOST_VIEWS))]:
+    for camera in spread(cameras, MOST_VIEWS):
         in_view |= reaching(some, camera, 0)
     share = float(in_view.double().mean())
     if share < LEAST_IN_VIEW:
@@ -251,6 +252,11 @@ def middle(places: Float[Tensor, "N 3"], origin: Origin) -> str:
     return "({:.8g}, {:.8g}, {:.8g})".format(*values)
 
 
-def spread(rows: Float[Tensor, "N ..."], most: int) -> Float[Tensor, "n ..."]:
+def spread(rows: Rows, most: int) -> Rows:
     """Return at most so many rows, evenly spread."""
     return rows[:: max(1, -(-len(rows) // most))]
+
+
+def thinned(gaussians: Gaussians) -> Gaussians:
+    """Return at most MOST_SPLATS Gaussians, evenly spread."""
+    return Gaussians(**{name: spread(value, MOST_SPLATS) for name, value in vars(gaussians).items()})
