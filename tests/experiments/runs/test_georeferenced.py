@@ -135,7 +135,7 @@ def test_exports_hold_the_coordinates_of_the_scene(
     assert distance.min(1).values.max() < steps
     assert distance.min(0).values.max() < steps
     told = {
-        ".ply": "read floats alone round",
+        ".ply": "read only floats round",
         ".glb": "node adds",
         ".compressed.ply": "floats, rounded to steps of 0.5 units",
     }

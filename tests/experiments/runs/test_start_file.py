@@ -178,7 +178,7 @@ def test_words_for_a_file_that_says_it_is_compensated(trained: Path, tmp_path: P
     own = composition_of(tmp_path / "mip.ply", ["scene=demo", "rasterizer.dilation=0.2"])
     assert compose(own, plugins()).raster.compensate is False
     for word in ("backbone=scaffold", "backbone.filter=mip", "iterations=5", "+experiment=x", "init=scratch"):
-        with pytest.raises(ConfigError, match="draws the file as it is"):
+        with pytest.raises(ConfigError, match="renders the file as it is"):
             composition_of(tmp_path / "mip.ply", ["scene=demo", word])
     with pytest.raises(ConfigError, match="needs photos"):
         composition_of(tmp_path / "mip.ply", ["eval.zoom=[1]"])

@@ -142,7 +142,7 @@ def newest(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor], list[Path]]
         raise CheckpointError(f"no checkpoint in {folder / 'checkpoints'} is usable: {problems[0]}")
     if (folder / "config.yaml").is_file():
         raise CheckpointError(f"{folder} holds no checkpoint: its run ended before the first one; train anew")
-    raise CheckpointError(f"{folder} holds no checkpoint: give the folder of a run (a splat file is no checkpoint)")
+    raise CheckpointError(f"{folder} holds no checkpoint: give the folder of a run (a splat file is not a checkpoint)")
 
 
 def restore(run: Run, training: bool = False) -> None:
@@ -160,7 +160,7 @@ def restore(run: Run, training: bool = False) -> None:
     try:
         run.generator.set_state(tensors.pop(GENERATOR).to(torch.uint8))
     except (KeyError, RuntimeError, TypeError) as error:
-        raise CheckpointError(f"a checkpoint of {run.folder} has no random state ({error})") from error
+        raise CheckpointError(f"the checkpoint of {run.folder} has no random state ({error}): remove it") from error
     for prefix, module in run.modules.items():
         module.load_state_dict(pop_prefixed(tensors, f"{prefix}."))
     run.backbone.table = restore_table(run.backbone.table, tensors)

@@ -291,7 +291,7 @@ def log_coordinates(path: Path, origin: Origin, local: bool, gaussians: Gaussian
     elif suffix == ".compressed.ply":
         message = f"positions are the scene's own; ends of chunks are floats, rounded to {steps}: {remedy}"
     else:
-        message = f"positions are the scene's own; programs that read floats alone round them to {steps}: {remedy}"
+        message = f"positions are the scene's own; programs that read only floats round them to {steps}: {remedy}"
     logger.info("%s: %s", path, message)
 
 

@@ -35,7 +35,7 @@ class Guard:
         if self.in_a_row >= PATIENCE:
             raise TrainingError(
                 f"{PATIENCE} steps in a row were not finite, last at step {step.number}, view {step.view.name}: "
-                f"{reason}; look at that view, or lower the learning rates"
+                f"{reason}; check that view, or lower the learning rates"
             )
         return reason
 
