@@ -102,9 +102,8 @@ def bake(run: Run, zoom: float = 1.0) -> Gaussians:
     """
     backbone = run.backbone
     if not isinstance(backbone, Bakeable):
-        raise InputError(
-            f"backbone {run.config['backbone']['name']} cannot be baked: its splats have no identity; give --view NAME"
-        )
+        name = run.config["backbone"]["name"]
+        raise InputError(f"backbone {name} cannot be baked: its splats have no identity; give --view NAME")
     sums = Sums.of(backbone.slot_count(), run.device)
     cameras = [view.camera for view in run.scene.train]
     count = min(len(cameras), MOST_CAMERAS)

@@ -136,9 +136,7 @@ def composition_of(path: Path, overrides: Sequence[str]) -> list[str]:
     """
     for word in overrides:
         if key_of(word) in OWN_KEYS:
-            raise ConfigError(
-                f"gsx eval {path} renders the file as it is: leave out '{word}', or train with init={path}"
-            )
+            raise ConfigError(f"gsx eval {path} renders the file as it is: leave out '{word}', or train: init={path}")
     if not any(word.startswith(("scene=", "dataset=")) for word in overrides):
         raise ConfigError(f"{path} needs photos to compare with: give scene=... scene.path=FOLDER")
     if not path.is_file():
