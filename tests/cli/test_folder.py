@@ -18,6 +18,7 @@ from synthetic_colmap import synthesize, write_photos, write_scene
 from gsx.builtin import plugins
 from gsx.cli import train as folders
 from gsx.cli.dispatch import main
+from gsx.cli.train import train
 from gsx.core.data.images import write_image
 from gsx.core.errors import InputError
 from gsx.experiments.runs import video
@@ -86,6 +87,7 @@ def test_a_path_that_exists_is_no_override(
         for words in (trained[-1], ["scene=colmap", f"scene.path={name}"]):
             assert Path(compose(words, plugins()).scene.options.path).resolve() == tmp_path / name
         assert main(["scenes", name]) == 0
+    monkeypatch.setattr(folders, "train", train)
     assert main(["--cfg", "job", "scene=colmap", "scene.path=in/a=b"]) == 0
     assert "path: in/a=b" in capsys.readouterr().out
 

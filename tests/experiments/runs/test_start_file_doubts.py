@@ -79,14 +79,14 @@ def test_hardly_any_splat_in_view_is_doubted() -> None:
     means = ball().means.clone()
     means[4:] += 1000
     (doubt,) = in_view_doubts(replace(ball(), means=means), around(), "test view")
-    assert doubt.startswith("only 2.00% of its splats are in view of any test view")
+    assert doubt.startswith("only 2.00% of the splats are in view of any test view")
 
 
 def test_points_far_from_all_splats_are_doubted() -> None:
     cloud = PointCloud(ball(150).means, torch.arange(450, dtype=torch.int64).view(150, 3).to(torch.uint8))
     assert not list(distance_doubts(ball(), cloud))
     (doubt,) = distance_doubts(replace(ball(), means=10 * ball().means), cloud)
-    assert "it holds a part of the scene, or is in other coordinates" in doubt
+    assert "the file holds a part of the scene, or is in other coordinates" in doubt
     few = PointCloud(cloud.positions[:9], cloud.colours[:9])
     assert not list(distance_doubts(replace(ball(), means=10 * ball().means), few))
     grey = PointCloud(cloud.positions, torch.full((150, 3), 127, dtype=torch.uint8))  # random ones: no evidence
