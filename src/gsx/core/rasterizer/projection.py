@@ -94,7 +94,7 @@ def project(
     """
     own = intrinsics_of(camera, intrinsics)
     refuse_unusable(camera, own, settings.jacobian_margin)
-    dilation, drawn = dilations_of(camera, intrinsics, settings)
+    dilation, drawn = settings.dilation_at(float(own[:2].detach().max()))
     lens = lens_of(camera, on_frame(own, camera.frame), dilation, settings)
     numbers = upload(lens, splats.means.device)
     points = camera.to_camera(splats.means)
@@ -125,15 +125,6 @@ def project(
         channels=channels,
         dropped=dropped,
     )
-
-
-def dilations_of(
-    camera: Camera, intrinsics: Float[Tensor, "4"] | None, settings: RasterSettings
-) -> tuple[float, float]:
-    """Returns `RasterSettings.dilation_at` the focal length of `intrinsics` or the camera."""
-    if settings.published_dilation:
-        return settings.dilation, 0.0
-    return settings.dilation_at(camera.focal if intrinsics is None else float(intrinsics[:2].max().detach()))
 
 
 def select_rows(ctx: Any, values: Float[Tensor, "N *rest"], ids: Int[Tensor, "M"]) -> Float[Tensor, "M *rest"]:

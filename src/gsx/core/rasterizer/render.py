@@ -15,7 +15,7 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.composite import composite_eager
 from gsx.core.rasterizer.grid import TileGrid
 from gsx.core.rasterizer.intersections import cap_tiles, intersect_tiles
-from gsx.core.rasterizer.projection import ScreenSplats, project
+from gsx.core.rasterizer.projection import project
 from gsx.core.rasterizer.settings import WINDOW_TILE, RasterSettings
 from gsx.core.shapes import Bool, Float, Int
 
@@ -39,21 +39,6 @@ class ScreenStatistics:
     """Largest blending weight over all pixels; None: not computed."""
     size: tuple[int, int]
     """(width, height) of the raster."""
-
-    @staticmethod
-    def before_blending(
-        screen: ScreenSplats, radii: Int[Tensor, "M"], size: tuple[int, int], learning: bool, absolute: bool
-    ) -> "ScreenStatistics":
-        """Returns the statistics before blending, with zeros for gradients."""
-        zeros = [torch.zeros_like(screen.means, requires_grad=learning) for _ in range(1 + absolute)]
-        return ScreenStatistics(
-            ids=screen.ids,
-            radii=radii,
-            means2d_offset=zeros[0],
-            absgrad=zeros[1] if absolute else None,
-            max_weights=None,
-            size=size,
-        )
 
     @property
     def visible(self) -> Bool[Tensor, "M"]:
@@ -113,11 +98,10 @@ def rasterize(
     screen = project(splats, camera, settings, intrinsics)
     intersections = cap_tiles(intersect_tiles(screen, camera, settings), settings.tile_cap)
     learning = torch.is_grad_enabled() and any(value.requires_grad for value in vars(splats).values())
-    statistics = ScreenStatistics.before_blending(screen, intersections.radii, camera.size, learning, absolute_gradient)
+    zeros = [torch.zeros_like(screen.means, requires_grad=learning) for _ in range(1 + absolute_gradient)]
+    offset, absgrad = zeros[0], zeros[1] if absolute_gradient else None
     channels = torch.cat([screen.channels, screen.depths[:, None]], 1) if depth else screen.channels
-    screen = replace(
-        screen, means=screen.means + statistics.means2d_offset, absgrad=statistics.absgrad, weigh=max_weight
-    )
+    screen = replace(screen, means=screen.means + offset, absgrad=absgrad, weigh=max_weight)
     composite = settings.compositors.get(settings.compositor_name, composite_eager)
     grid = TileGrid.of(camera, settings.tile_size)
     blended, max_weights = composite(screen, channels, intersections, grid, settings)
@@ -131,7 +115,14 @@ def rasterize(
         depth=blended[count] if depth else None,
         intersections=len(intersections.splats),
         dropped=screen.dropped,
-        screen=replace(statistics, max_weights=max_weights),
+        screen=ScreenStatistics(
+            ids=screen.ids,
+            radii=intersections.radii,
+            means2d_offset=offset,
+            absgrad=absgrad,
+            max_weights=max_weights,
+            size=camera.size,
+        ),
     )
 
 

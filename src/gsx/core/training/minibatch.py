@@ -101,14 +101,18 @@ def merge_accounts(accounts: Sequence[Mapping[str, dict[str, Any]]]) -> dict[str
     merged = {}
     for name in dict.fromkeys(name for by_name in accounts for name in by_name):
         parts = [by_name[name] for by_name in accounts if name in by_name]
-        checks = dict.fromkeys(check for part in parts for check in part["warned"])
-        merged[name] = {
-            "event": parts[0]["event"],
-            "asked": sum_by_scale(part["asked"] for part in parts),
-            "dropped": sum_by_scale(part["dropped"] for part in parts),
-            "warned": {check: sum_by_scale(part["warned"].get(check, {}) for part in parts) for check in checks},
-        }
+        merged[name] = {"event": parts[0]["event"]} | sum_accounts(parts)
     return merged
+
+
+def sum_accounts(accounts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Adds up the counts of one augmenter's accounts, by scale."""
+    checks = dict.fromkeys(check for account in accounts for check in account["warned"])
+    return {
+        "asked": sum_by_scale(account["asked"] for account in accounts),
+        "dropped": sum_by_scale(account["dropped"] for account in accounts),
+        "warned": {check: sum_by_scale(account["warned"].get(check, {}) for account in accounts) for check in checks},
+    }
 
 
 def sum_by_scale(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:

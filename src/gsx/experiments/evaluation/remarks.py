@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from gsx.core.plugins import hookimpl
-from gsx.core.training.minibatch import sum_by_scale
+from gsx.core.training.minibatch import sum_accounts
 from gsx.core.training.run import Run, StepResult
 from gsx.modules.catalogue import MODULES
 
@@ -75,15 +75,10 @@ def module_remarks(run: Run, evaluation: Mapping[str, Any]) -> dict[str, list[st
 
 def totals(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Pictures asked for, and shares dropped and warned of, by scale, over the events of an augmenter."""
-    asked = sum_by_scale(event["asked"] for event in events)
-    checks = dict.fromkeys(check for event in events for check in event["warned"])
-    return {
-        "asked": asked,
-        "dropped": shares(sum_by_scale(event["dropped"] for event in events), asked),
-        "warned": {
-            check: shares(sum_by_scale(event["warned"].get(check, {}) for event in events), asked) for check in checks
-        },
-    }
+    sums = sum_accounts(events)
+    asked = sums["asked"]
+    warned = {check: shares(counts, asked) for check, counts in sums["warned"].items()}
+    return {"asked": asked, "dropped": shares(sums["dropped"], asked), "warned": warned}
 
 
 def shares(counts: Mapping[str, int], asked: Mapping[str, int]) -> dict[str, float]:
