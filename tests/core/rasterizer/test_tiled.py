@@ -73,7 +73,7 @@ def test_pieces_that_a_gpu_cannot_hold_are_halved_until_it_can(monkeypatch: pyte
 def test_a_tile_with_too_many_pairs_is_refused() -> None:
     with pytest.raises(InputError, match=r"16x16 px needs \d+ splat-tile pairs, more than rasterizer.max_pairs=3"):
         rasterize_tiled(random_splats(), front_camera(), any_path(max_pairs=3))
-    with pytest.raises(InputError, match="pieces of 0 px"):
+    with pytest.raises(InputError, match="windows of 0 px"):
         rasterize_tiled(random_splats(), front_camera(), any_path(), pixels=0)
 
 
