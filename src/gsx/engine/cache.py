@@ -226,29 +226,27 @@ def trim(gigabytes: float) -> list[Path]:
 
     Entries that a running process uses stay, and so do folders without a manifest, which are not gsx's.
     """
-    since, removed = used_since(), []
-    used, sizes = entries()
-    excess = sum(sizes.values()) - gigabytes * 1e9
-    for entry in sorted(used, key=lambda one: used[one]):
-        if excess > 0 and used[entry] < since and remove_entry(entry, used[entry]):
-            excess -= sizes[entry]
+    since, removed, freed, known = used_since(), list[Path](), 0, entries()
+    excess = sum(size for _, size, _ in known) - gigabytes * 1e9
+    for used, size, entry in known:
+        if freed < excess and used < since and remove_entry(entry, used):
+            freed += size
             removed.append(entry)
     if removed:
-        freed = sum(sizes[entry] for entry in removed) / 1e9
-        logger.info("cache: removed %d entries (%.1f GB)", len(removed), freed)
+        logger.info("cache: removed %d entries (%.1f GB)", len(removed), freed / 1e9)
     return removed
 
 
-def entries() -> tuple[dict[Path, float], dict[Path, int]]:
-    """Returns (last use of each entry, seconds since 1970; its bytes)."""
-    used, sizes, manifests = {}, {}, list[Path]()
+def entries() -> list[tuple[float, int, Path]]:
+    """Lists (last use, seconds since 1970; bytes; folder) of all entries, least recently used first."""
+    known, manifests = [], list[Path]()
     with suppress(OSError):  # another process may remove the cache meanwhile
         manifests += cache_root().glob(f"*/*/{MANIFEST}")
     for manifest in manifests:
         with suppress(OSError):  # or this entry
             size = sum(path.stat().st_size for path in manifest.parent.rglob("*"))
-            used[manifest.parent], sizes[manifest.parent] = manifest.stat().st_mtime, size
-    return used, sizes
+            known.append((manifest.stat().st_mtime, size, manifest.parent))
+    return sorted(known)
 
 
 def remove_entry(entry: Path, used: float) -> bool:

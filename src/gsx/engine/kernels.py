@@ -103,17 +103,12 @@ def cut_exp(x: Tensor, rules: Rules) -> Tensor:
     return torch.where(x >= rules.least, value, 0.0)
 
 
-def log_alpha(row: Entry, x: Axis, y: Axis) -> Light:
-    """Returns ln alpha of one entry at every pixel."""
+def gaussian(row: Entry, x: Axis, y: Axis, rules: Rules) -> Light:
+    """Returns o exp(-s^2 - r^2) of one entry at every pixel, zero below alpha_min, before the clamp at alpha_max."""
+    row, x, y = row.to(rules.evaluation), x.to(rules.evaluation), y.to(rules.evaluation)
     u0, u1, k0, u2, k1, log_opacity = row[: ROW - 1]
     s, r = u0 * x + (u1 * y + k0), u2 * y + k1
-    return log_opacity - r * r - s * s
-
-
-def gaussian(row: Entry, x: Axis, y: Axis, rules: Rules) -> Light:
-    """Returns o exp(-s^2 - r^2), zero below alpha_min, before the clamp at alpha_max."""
-    row, x, y = row.to(rules.evaluation), x.to(rules.evaluation), y.to(rules.evaluation)
-    return cut_exp(log_alpha(row, x, y), rules)
+    return cut_exp(log_opacity - r * r - s * s, rules)
 
 
 def clamped(value: Light, row: Entry) -> Light:

@@ -31,6 +31,8 @@ pieces but the last."""
 MOST_PIECES = 8
 """Most pieces of a list: each costs an operation that hands light on to the next."""
 
+Groups: TypeAlias = Int[Tensor, "G L"]
+"""List of each lane."""
 Places: TypeAlias = tuple[Int[Tensor, "_"], Int[Tensor, "_"]]
 """Groups and lanes of some lists."""
 
@@ -117,7 +119,7 @@ def lay_out(intersections: TileIntersections, splats: int, chunk: int, batch: in
     )
 
 
-def by_length(lengths: Int[Tensor, "N"]) -> tuple[Int[Tensor, "G L"], Int[Tensor, "G"]]:
+def by_length(lengths: Int[Tensor, "N"]) -> tuple[Groups, Int[Tensor, "G"]]:
     """Returns (lists in groups, longest first, N for none; longest list of each group). At least two groups."""
     lengths, order = torch.sort(lengths, descending=True, stable=True)
     count = max(2, -(-len(order) // LANES)) * LANES
@@ -125,7 +127,7 @@ def by_length(lengths: Int[Tensor, "N"]) -> tuple[Int[Tensor, "G L"], Int[Tensor
     return lanes.view(-1, LANES), pad(lengths, (0, count - len(order)))[::LANES]
 
 
-def pieces_of(lists: Lists, lanes: Int[Tensor, "G L"]) -> list[tuple[Places, Places]]:
+def pieces_of(lists: Lists, lanes: Groups) -> list[tuple[Places, Places]]:
     """Returns `Lanes.follows`."""
     rank = torch.empty_like(lists.tiles)
     rank[lanes.view(-1)[: len(rank)]] = torch.arange(len(rank), device=rank.device)
@@ -138,12 +140,7 @@ def pieces_of(lists: Lists, lanes: Int[Tensor, "G L"]) -> list[tuple[Places, Pla
 
 
 def pairs_in_blocks(
-    lists: Lists,
-    count: int,
-    lanes: Int[Tensor, "G L"],
-    groups: Int[Tensor, "S"],
-    chunks: Int[Tensor, "S"],
-    chunk: int,
+    lists: Lists, count: int, lanes: Groups, groups: Int[Tensor, "S"], chunks: Int[Tensor, "S"], chunk: int
 ) -> Int[Tensor, "S K L"]:
     """Returns the pair of every entry: consecutive in a list; `count`, one past the last, behind its end.
 
