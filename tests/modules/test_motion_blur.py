@@ -173,7 +173,5 @@ def test_the_gain_of_a_ring_is_free_and_that_of_a_direction_is_not() -> None:
         after = kernel_spectrum((3.0, 1.0), spectra)[here]
         gain = max(0.0, float((spectra.shared[here] * after).sum() / (spectra.sharp[here] * after**2).sum()))
         left += float((gain**2 * spectra.sharp[here] * after**2 - 2 * gain * spectra.shared[here] * after).sum())
-    assert error_after((3.0, 1.0), spectra) == pytest.approx(spectra.photograph + left, rel=1e-9)
-    assert error_after((0.0, 0.0), spectra_of(sharp, 2 * sharp, None)) == pytest.approx(
-        0, abs=1e-9 * spectra.photograph
-    )
+    assert error_after((3.0, 1.0), spectra) == pytest.approx(spectra.photo + left, rel=1e-9)
+    assert error_after((0.0, 0.0), spectra_of(sharp, 2 * sharp, None)) == pytest.approx(0, abs=1e-9 * spectra.photo)

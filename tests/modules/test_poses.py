@@ -194,7 +194,7 @@ def test_a_world_that_moves_shows_the_same_from_cameras_that_move_with_it() -> N
     camera, point = cameras()[0], torch.tensor([[0.3, -0.2, 0.4]]).double()
     turn, move = torch.tensor([[0.3, 0.2, -0.1], [1.0, 2.0, 3.0]], dtype=torch.float64)
     motion = Motion(rotation=rotation_by(turn), move=move)
-    own = camera.project(motion.of(point.T).T)
+    own = camera.project(motion.apply(point.T).T)
     other = in_moved_world(camera, motion).project(point)
     torch.testing.assert_close(own, other)
 
