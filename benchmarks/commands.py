@@ -1,4 +1,4 @@
-"""The README's whole commands as a user types them, one after the other: python benchmarks/commands.py
+"""Whole commands as a user types them, one after the other: python benchmarks/commands.py
 
 Each is a process of its own; those found finished below --runs are not trained again, and keep the times they had.
 Further words go to every command, to try this out: `iterations=20 scene.width=64 scene.height=48 --to FOLDER`. Takes
