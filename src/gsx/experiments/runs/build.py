@@ -36,15 +36,9 @@ from gsx.experiments.runs.start_file import in_front_of, one_point, start_from
 
 logger = logging.getLogger(__name__)
 
-# -- device and ranks --------------------------------------------------------------------------------------------------
-
 
 def choose_device(name: str) -> torch.device:
-    """Return the device that is named auto (a GPU if there is one), cpu or cuda.
-
-    Raises:
-        ConfigError: the name is unknown or the device absent.
-    """
+    """Return the device auto (a GPU if there is one), cpu or cuda; raise ConfigError for others and absent ones."""
     if name not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"device is '{name}'; choose auto, cpu or cuda")
     if name == "cuda" and not torch.cuda.is_available():
@@ -53,11 +47,7 @@ def choose_device(name: str) -> torch.device:
 
 
 def placed(device: torch.device) -> torch.device:
-    """Return the device of this rank: each rank has its own GPU.
-
-    Raises:
-        ConfigError: there are fewer GPUs than ranks on this machine.
-    """
+    """Return the device of this rank, its own GPU; raise ConfigError if there are fewer than ranks."""
     if device.type != "cuda" or current_ranks().size == 1:
         return device
     rank, count = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
@@ -84,9 +74,6 @@ def refuse_shared(modules: Modules, ranks: Ranks) -> None:
                 f"training.{name} works in one process, and {ranks.size} train together: switch it off "
                 f"(training.{name}.when=never), or start gsx without torchrun"
             )
-
-
-# -- the process -------------------------------------------------------------------------------------------------------
 
 
 def prepare_process(device: torch.device, training: bool) -> None:
@@ -128,9 +115,6 @@ def keep_compiled_code() -> None:
         logger.info("compiled code is not kept in the cache: %s", error)
     else:
         os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(folder))
-
-
-# -- the run -----------------------------------------------------------------------------------------------------------
 
 
 def build(
@@ -202,11 +186,7 @@ def build_modules(settings: Settings, scene: Scene, device: torch.device) -> Mod
 
 
 def build_augmenters(settings: Settings, scene: Scene, new_backbone: NewBackbone) -> dict[str, Augmenter]:
-    """Build the augmenters of a run, in order; they share regenerators by role.
-
-    Raises:
-        ConfigError: together they replace the whole loss of the photos.
-    """
+    """Build the augmenters of a run, in order; they share regenerators by role."""
     regenerator = cache(partial(regenerator_of, settings=settings))
     augmenters: dict[str, Augmenter] = {}
     for name, chosen in settings.augmenters.items():

@@ -64,9 +64,6 @@ def named(texts: Sequence[str], most: int = 5) -> str:
     return ", ".join(texts[:most]) + (", ..." if texts[most:] else "")
 
 
-# -- exposure ----------------------------------------------------------------------------------------------------------
-
-
 def light_at(view: View, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
     """Return a photo's linear light at each point; NaN: not in view, too dark, too bright, or masked."""
     image, counted = view.image(), view.counted()
@@ -126,9 +123,6 @@ def exposure_line(views: Sequence[View], gains: Float[Tensor, "V"]) -> str:
         return line
     worst = named([f"{views[i].name} ({float(gains[i]):+.2f})" for i in odd])
     return f"{line}; off by more than a third: {worst}; lock exposure and white balance"
-
-
-# -- coverage ----------------------------------------------------------------------------------------------------------
 
 
 def coverage_line(views: Sequence[View], visible: Bool[Tensor, "V P"]) -> str:

@@ -95,11 +95,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins, keep_states: bool = 
 
 
 def warm_or_eager(run: Run, settings: Settings) -> None:
-    """Compile what steps need; if that fails at the start of a run with path=auto, use the eager path.
-
-    Raises:
-        CompilerError: compiling failed elsewhere.
-    """
+    """Compile what steps need; if that fails at the start of a run with path=auto, use the eager path."""
     try:
         warm(run)
     except CompilerError as error:

@@ -44,11 +44,7 @@ class Entry:
 
 
 def explain(key: str, overrides: Sequence[str], plugins: Plugins) -> list[str]:
-    """Return lines on a key, a group or an option of one (`backbone=scaffold`), in a composition.
-
-    Raises:
-        ConfigError: there is no such key; the nearest is named.
-    """
+    """Return lines on a key, a group or an option of one (`backbone=scaffold`), in a composition."""
     group, _, option = key.partition("=")
     with Compositions(plugins) as compositions:
         if option:

@@ -104,11 +104,7 @@ def other_options(files: RunFiles, settings: Settings, plugins: Plugins, other_s
 
 
 def write_anew(run: Run, facts: dict[str, Any], problem: str) -> None:
-    """Write a lost environment.json anew, log that the start is unknown, and keep a damaged file next to it.
-
-    Raises:
-        OSError: the file exists but cannot be read now.
-    """
+    """Write a lost environment.json anew, log that the start is unknown, and keep a damaged file next to it."""
     path = run.folder / FACTS
     with suppress(FileNotFoundError, ValueError):
         read_json(path)

@@ -77,11 +77,7 @@ def describe(path: str | Path, plugins: Plugins, patient: bool = False) -> list[
 
 
 def scene_loaders(path: Path, plugins: Plugins) -> Readable:
-    """Return the loaders that can read a folder, the most specific first.
-
-    Raises:
-        InputError: there is none, or it is a run or a splat file.
-    """
+    """Return the loaders that can read a folder; raise InputError if there is none, or for a run or a splat file."""
     refuse_run(path)
     refuse_splats(path)
     if loaders := readable(path, plugins):

@@ -108,9 +108,6 @@ def count_notes(settings: Settings) -> list[str]:
     return [] if count == published else [f"{images}/ holds {count} files, published are {published}: {compared}."]
 
 
-# -- units -------------------------------------------------------------------------------------------------------------
-
-
 def placed(scene: Scene, unit: float, origin: Origin | None) -> Scene:
     """Return the scene around an origin, in units; origin: in these units, None: chosen by the scene."""
     origin = scaled(origin_of(scene), unit) if origin is None else origin

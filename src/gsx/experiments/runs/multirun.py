@@ -95,11 +95,7 @@ def refuse_one_folder(overrides: Sequence[Any]) -> None:
 
 
 def words_of(override: Any, every: bool) -> list[str]:
-    """Return an override with each value of its sweep, or with the first; itself if it does not sweep.
-
-    Raises:
-        ConfigError: it sweeps no value, or values that are unknown before Hydra starts.
-    """
+    """Return an override with each value of its sweep, or with the first; itself if it does not sweep."""
     from hydra.errors import HydraException
 
     if not override.is_sweep_override():

@@ -48,9 +48,6 @@ OF_TRAINING = ("iterations", "length", "seed", "init", "axes", "reuse", "warm_st
 """Keys that change how and where a run is trained, and no figure of a trained run."""
 
 
-# -- a new run ---------------------------------------------------------------------------------------------------------
-
-
 def refuse_used(folder: str, remedy: str = "") -> None:
     """Raise InputError if the run folder exists and is not empty; `remedy`: for verbs that do not train."""
     path = Path(folder)
@@ -128,9 +125,6 @@ def make_folder(
         shutil.rmtree(run.folder, ignore_errors=True)
         raise
     return run.folder
-
-
-# -- an existing run ---------------------------------------------------------------------------------------------------
 
 
 def refuse_other(folder: Path) -> None:
@@ -225,9 +219,6 @@ def restored(settings: Settings, folder: Path, training: bool = False) -> Run:
     run.progress.curves = [line for line in read_curves(folder) if line["step"] <= run.step]
     recall_accounts(run.augmenters, run.progress.curves)
     return run
-
-
-# -- a run named by its composition (reuse=true) -----------------------------------------------------------------------
 
 
 def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: ExitStack) -> Run | None:

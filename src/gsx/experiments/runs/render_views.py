@@ -71,11 +71,7 @@ def run_pictures(run: Run, settings: Settings) -> Draw:
 
 
 def file_pictures(path: Path, cameras: Sequence[Camera] = (), axes: str = AUTO) -> Draw:
-    """Return a function that renders a splat file over black for any camera in its coordinates; `axes`: of the file.
-
-    Raises:
-        InputError: it cannot be read, or no splat is in view of any of `cameras`.
-    """
+    """Return a function that renders a splat file over black; raise InputError if no splat is in view of `cameras`."""
     watch_cores()
     (gaussians, origin), raster = read_around(path, axes), rules_of(path)
     if cameras:

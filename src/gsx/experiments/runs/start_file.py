@@ -94,12 +94,7 @@ def start_doubts(settings: Settings, scene: Scene, start: Gaussians | None) -> l
 
 
 def start_from(backbone: Backbone[Any], gaussians: Gaussians, name: str) -> None:
-    """Replace a backbone's primitives by Gaussians.
-
-    Raises:
-        ConfigError: the backbone cannot start from Gaussians.
-        InputError: it cannot start from these.
-    """
+    """Replace a backbone's primitives by Gaussians; raise ConfigError if it does not support that."""
     if not isinstance(backbone, FromGaussians):
         raise ConfigError(f"backbone={name} cannot start from a splat file: choose backbone=gs3d, or leave out init")
     backbone.start_from(gaussians)
@@ -129,11 +124,7 @@ def rules_of(path: Path) -> RasterSettings:
 
 
 def composition_of(path: Path, overrides: Sequence[str]) -> list[str]:
-    """Return the overrides that evaluate a splat file on a scene.
-
-    Raises:
-        ConfigError: an override is for training, or there is no scene.
-    """
+    """Return the overrides that evaluate a splat file; raise ConfigError for keys of training or without a scene."""
     for word in overrides:
         if key_of(word) in OWN_KEYS:
             raise ConfigError(f"gsx eval {path} renders the file as it is: leave out '{word}', or train: init={path}")

@@ -20,11 +20,7 @@ logger = logging.getLogger(__name__)
 
 
 def build_trackers(trackers: Mapping[str, Chosen]) -> "list[Tracking]":
-    """Return the chosen trackers as listeners.
-
-    Raises:
-        ConfigError: a tracker lacks a package or cannot work with its options.
-    """
+    """Return the chosen trackers as listeners; raise ConfigError if one lacks a package."""
     return [Tracking(name, chosen.component.factory(chosen.options)) for name, chosen in trackers.items()]
 
 

@@ -23,11 +23,7 @@ LONG = 200
 
 
 def verified(scene: Scene) -> Scene:
-    """Return the scene if its photos and masks can be decoded; remember them by name, size and time.
-
-    Raises:
-        InputError: some are damaged or missing.
-    """
+    """Return the scene if its photos and masks can be decoded, else raise InputError; remember checked files."""
     sources = [view.source for view in (*scene.train, *scene.test)]
     photos = [source for source in sources if isinstance(source, PhotoSource)]
     masks = [source.mask.path for source in photos if source.mask is not None]
