@@ -85,7 +85,7 @@ def test_old_keys_that_are_typed_name_the_new_ones(monkeypatch: pytest.MonkeyPat
     path.write_text(yaml.safe_dump(yaml.safe_load((CONFIGS / "plain.yaml").read_text()) | {"trunk_gb": 10.0}))
     words = ["training.bunch=4"]
     for made in (lambda: compose(words, plugins()), lambda: read_config(path, plugins(), words)):
-        with pytest.raises(ConfigError, match=r"'training\.bunch' .* It is now called 'training\.batch'"):
+        with pytest.raises(ConfigError, match=r"'training\.bunch'.*\. It is now called 'training\.batch'"):
             made()
-    with pytest.raises(ConfigError, match=r"'trunk_at' .* It is now called 'warm_start_at'"):
+    with pytest.raises(ConfigError, match=r"'trunk_at'.*\. It is now called 'warm_start_at'"):
         compose(["trunk_at=[5]"], plugins())
