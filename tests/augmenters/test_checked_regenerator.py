@@ -215,7 +215,7 @@ def test_accounts_of_processes_add_up_and_outlive_an_interruption() -> None:
     augmenter = Mine()
     recall_accounts({"mine": augmenter}, lines)
     tally = augmenter.regenerator.tally
-    assert (tally.asked, tally.dropped) == ({"1": 2, "2": 8}, {"2": 3})
+    assert (tally.requested, tally.dropped) == ({"1": 2, "2": 8}, {"2": 3})
 
 
 def test_the_mean_of_samples_counts_and_is_projected_where_that_is_asked_for() -> None:

@@ -380,14 +380,14 @@ def test_bias_lets_a_gaussian_be_drawn_from_farther() -> None:
     close = ((of == 2) & (reach < 1.5) & (reach > 1.0)).nonzero()[:, 0]
     assert len(close) > 0
     row = int(close[0])
-    assert row not in backbone.visibility.shown(backbone.table, camera, 40000).rows.tolist()  # type: ignore[union-attr]
+    assert row not in backbone.visibility.visible(backbone.table, camera, 40000).rows.tolist()  # type: ignore[union-attr]
     backbone.table["bias"][row] = 0.6
-    assert row in backbone.visibility.shown(backbone.table, camera, 40000).rows.tolist()  # type: ignore[union-attr]
+    assert row in backbone.visibility.visible(backbone.table, camera, 40000).rows.tolist()  # type: ignore[union-attr]
 
 
 def test_levels_that_wait_are_not_drawn() -> None:
     backbone = small_octree()
-    shown = backbone.visibility.shown(backbone.table, seen_from(1.0), 1)
+    shown = backbone.visibility.visible(backbone.table, seen_from(1.0), 1)
     assert shown.rows is not None
     assert int(backbone.table["level"][shown.rows].max()) == levels_of(backbone).first < 2
 
@@ -410,7 +410,7 @@ def test_gradients_count_for_the_rows_that_were_drawn() -> None:
 def test_fading_levels_are_fainter() -> None:
     backbone = small_octree("levels.mode=progressive")
     camera = seen_from(3.0)
-    shown = backbone.visibility.shown(backbone.table, camera, 40000)
+    shown = backbone.visibility.visible(backbone.table, camera, 40000)
     assert shown.rows is not None
     assert shown.weights is not None
     assert 0 < float(shown.weights.min()) < 0.9

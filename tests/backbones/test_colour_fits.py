@@ -128,7 +128,7 @@ def test_rows_that_no_view_shows_keep_what_they_have() -> None:
     with torch.no_grad():
         model.table["means"][1] = torch.tensor([0.0, 0.0, 100.0])
     fits = fits_of(model)
-    assert fits.shown.tolist() == [12, 0]
+    assert fits.views.tolist() == [12, 0]
     for degree in range(3):
         own = coefficients_of(model.table, degree)
         torch.testing.assert_close(fitted(fits, degree)[..., 1], own[..., 1])

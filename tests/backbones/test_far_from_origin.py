@@ -14,7 +14,7 @@ from torch import Tensor
 from gsx.backbones.anchors import Anchors
 from gsx.backbones.clone_split import VisibleByLevel
 from gsx.backbones.gs3d import GS3D
-from gsx.backbones.levels import distance_range, drawn, seen_fraction, viewpoints_of
+from gsx.backbones.levels import distance_range, drawn, drawn_fraction, viewpoints_of
 from gsx.backbones.mip import filter_sizes
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import Scene
@@ -134,7 +134,7 @@ def test_levels_and_filters_have_the_distances_of_float64() -> None:
     for places, mapped_to, at in ((means, camera, views), (away, moved(camera), far_views)):
         shown, _ = drawn(replace(levels, views=at), places, ones, bias, mapped_to, levels.count - 1)
         assert torch.equal(shown, within)
-    shares = [seen_fraction(replace(levels, views=v), p, of) for v, p in ((views, means), (far_views, away))]
+    shares = [drawn_fraction(replace(levels, views=v), p, of) for v, p in ((views, means), (far_views, away))]
     assert torch.equal(shares[1], shares[0])
     torch.testing.assert_close(
         filter_sizes(away, far_cameras, near.options.mip),

@@ -19,11 +19,11 @@ from gsx.backbones.levels import (
     derive,
     distance_range,
     drawn,
+    drawn_fraction,
     facts_of,
     initial_nodes,
     kept,
     level_count,
-    seen_fraction,
     switch_points,
     thresholds,
     unlocked,
@@ -255,7 +255,7 @@ def test_levels_end_at_their_distances(mode, shift):
             far = [False] * 3 if level else [True] * 3  # what the other camera draws
             wanted = [True, level == 0, level == 0]
             shares = [(a + b) / 2 for a, b in zip(wanted, far, strict=True)]
-            assert seen_fraction(levels, places, of).tolist() == shares
+            assert drawn_fraction(levels, places, of).tolist() == shares
             assert drawn(levels, places, of, torch.zeros(3), view, 3)[0].tolist() == wanted
 
 

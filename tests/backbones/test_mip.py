@@ -19,7 +19,7 @@ from gsx.backbones import mip
 from gsx.backbones.density import mean_absolute, mean_gradient, zero_statistics
 from gsx.backbones.density_control import candidates
 from gsx.backbones.gs3d import GS3D
-from gsx.backbones.mip import MATCHED, MipOptions, earned_size, filter_sizes, several_views
+from gsx.backbones.mip import MATCHED, MipOptions, filter_sizes, pseudo_view_sizes, several_views
 from gsx.backbones.sampling import quantile
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
@@ -239,7 +239,7 @@ def test_pseudo_views_narrow_what_they_see_by_as_much_as_their_pixels_count() ->
         pixels = None if weight is None else torch.full((100, 100), weight, dtype=torch.uint8)
         target = torch.zeros(3, 100, 100, dtype=torch.uint8)
         view = PseudoView(camera=window, target=target, parent=0, pixel_weight=pixels)
-        found = earned_size(points, view, sizes, OPTIONS)
+        found = pseudo_view_sizes(points, view, sizes, OPTIONS)
         assert found.tolist() == pytest.approx([float(sizes[0]) / 4**exponent, torch.inf, torch.inf])
 
 
@@ -247,7 +247,7 @@ def test_a_coarser_pseudo_view_widens_nothing() -> None:
     photograph = look_at([0, -4, 0], [0, 0, 0], fov_x=1.0, width=100, height=100)
     view = PseudoView(camera=photograph.zoom(0.5), target=torch.zeros(3, 50, 50, dtype=torch.uint8), parent=0)
     sizes = filter_sizes(torch.zeros(1, 3), [photograph], OPTIONS)
-    assert torch.equal(earned_size(torch.zeros(1, 3), view, sizes, OPTIONS), sizes)
+    assert torch.equal(pseudo_view_sizes(torch.zeros(1, 3), view, sizes, OPTIONS), sizes)
 
 
 # -- how the filter enters (10.3) --------------------------------------------------------------------------------------

@@ -52,7 +52,7 @@ class Tally:
     """Requests that are in no account yet; without their pictures."""
     latest: dict[str, Any] = field(default_factory=dict)
     """The last account."""
-    asked: Counter[str] = field(default_factory=Counter)
+    requested: Counter[str] = field(default_factory=Counter)
     """All requests so far, by scale."""
     dropped: Counter[str] = field(default_factory=Counter)
     """Those of them that were dropped."""
@@ -60,7 +60,7 @@ class Tally:
     def recall(self, accounts: Sequence[Mapping[str, Any]]) -> None:
         """Counts what a run requested before it was interrupted."""
         for account in accounts:
-            self.asked.update(account["asked"])
+            self.requested.update(account["asked"])
             self.dropped.update(account["dropped"])
 
     def account(self, event: int, whole: bool = True) -> dict[str, Any]:
@@ -73,19 +73,19 @@ class Tally:
             TrainingError: more than half of the pictures of a scale could not be used.
         """
         redrawn, self.pending = self.pending, []
-        asked, dropped = by_scale(redrawn), by_scale([one for one in redrawn if one.problem])
-        self.asked.update(asked)
+        requested, dropped = by_scale(redrawn), by_scale([one for one in redrawn if one.problem])
+        self.requested.update(requested)
         self.dropped.update(dropped)
         for scale, count in dropped.items():
             reason = next(one.problem for one in redrawn if one.problem and str(one.scale) == scale)
-            logger.warning("%s: %d of %d x%s pictures dropped: %s", self.name, count, asked[scale], scale, reason)
-            lost, total = (count, asked[scale]) if whole else (self.dropped[scale], self.asked[scale])
+            logger.warning("%s: %d of %d x%s pictures dropped: %s", self.name, count, requested[scale], scale, reason)
+            lost, total = (count, requested[scale]) if whole else (self.dropped[scale], self.requested[scale])
             if lost > MOST_DROPPED * total and (whole or total >= FEWEST):
                 raise TrainingError(
                     f"augmenter {self.name} lost {lost} of {total} pictures at x{scale}, step {event}: {reason}; "
                     f"{', or '.join(self.remedies)}"
                 )
-        self.latest = {"event": event, "asked": asked, "dropped": dropped, "warned": self.warned(redrawn)}
+        self.latest = {"event": event, "asked": requested, "dropped": dropped, "warned": self.warned(redrawn)}
         return self.latest
 
     def warned(self, redrawn: Sequence[Redrawn]) -> dict[str, dict[str, int]]:

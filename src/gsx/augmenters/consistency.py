@@ -26,9 +26,9 @@ def settled(
     near: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int, reduction: Reduction
 ) -> UInt8[Tensor, "3 H W"]:
     """Rounded; where that reduces to another level, what is missing is spread over the pixels that it came from."""
-    given = low.float() / 255
+    known = low.float() / 255
     for _ in range(REPAIRS):
-        off = given - reduction.reduce(to_uint8(near).float() / 255, factor)
+        off = known - reduction.reduce(to_uint8(near).float() / 255, factor)
         wrong = torch.where(off.abs() * 255 > 0.5, off, 0)
         if not bool(wrong.any()):
             break
@@ -42,7 +42,7 @@ def repaired(near: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: 
     Values are moved by one level at a time, those first that rounding had moved the other way the most.
     """
     values = blocks(to_uint8(near).long(), factor)
-    wanted = blocks(near * 255, factor)
+    exact = blocks(near * 255, factor)
     area = factor * factor
     lowest = -(-(2 * low.long() - 1) * area // 2).flatten()
     highest = ((2 * low.long() + 1) * area - 1).div(2, rounding_mode="floor").flatten()
@@ -51,12 +51,12 @@ def repaired(near: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: 
         step = (sums < lowest).long() - (sums > highest).long()
         if not bool(step.any()):
             return unblocked(values, low.shape, factor).to(torch.uint8)
-        values = values + moves(values, wanted, step)
+        values = values + moves(values, exact, step)
 
 
-def moves(values: Int[Tensor, "B a"], wanted: Float[Tensor, "B a"], step: Int[Tensor, "B"]) -> Int[Tensor, "B a"]:
+def moves(values: Int[Tensor, "B a"], exact: Float[Tensor, "B a"], step: Int[Tensor, "B"]) -> Int[Tensor, "B a"]:
     """One level more or less in the value of each block for which that costs least, within 0..255."""
-    gain = (wanted - values) * step[:, None]
+    gain = (exact - values) * step[:, None]
     allowed = ((values + step[:, None]) >= 0) & ((values + step[:, None]) <= 255)
     chosen = torch.where(allowed, gain, -torch.inf).argmax(1)
     return torch.zeros_like(values).scatter_(1, chosen[:, None], step[:, None])

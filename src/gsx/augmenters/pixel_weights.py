@@ -66,10 +66,10 @@ def sampling_scores(
     finest, views = torch.full_like(largest, -1, dtype=torch.long), torch.zeros_like(largest)
     for number, camera in enumerate(photographs):
         radii = undilated_radii(splats.means, splats.scales, splats.quats, camera, raster)
-        seen = radii >= 0
+        visible = radii >= 0
         finest[radii > largest] = number
-        largest, smallest = largest.maximum(radii), torch.where(seen, smallest.minimum(radii), smallest)
-        views += seen
+        largest, smallest = largest.maximum(radii), torch.where(visible, smallest.minimum(radii), smallest)
+        views += visible
     score = torch.sigmoid((largest / smallest - BETTER) / SOFTNESS)
     return torch.where(views < LEAST_VIEWS, 0.0, score), finest
 
@@ -109,11 +109,11 @@ def sampled_better(
 
 
 def agreeing(
-    result: Float[Tensor, "3 H W"], given: Float[Tensor, "3 h w"], scale: int, reduction: Reduction, levels: float
+    result: Float[Tensor, "3 H W"], source: Float[Tensor, "3 h w"], scale: int, reduction: Reduction, levels: float
 ) -> Float[Tensor, "H W"]:
     """1 in blocks where the result, reduced, is within `levels` of 255 of what it was made from in all channels, else
     0."""
-    off = (reduction.reduce(result.clamp(0, 1), scale) - given).abs().amax(0) * 255
+    off = (reduction.reduce(result.clamp(0, 1), scale) - source).abs().amax(0) * 255
     return as_blocks((off <= levels).float(), scale)
 
 

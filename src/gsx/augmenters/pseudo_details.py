@@ -162,8 +162,8 @@ class PseudoDetails(Redrawing):
         """(pseudo views of some training views, facts) of an event, from the model as it is now."""
         learnt = self.regenerator.prepare(run, self.context)
         if learnt:
-            told = ", ".join(f"{name} {value:.3g}" for name, value in learnt.items())
-            logger.info("%s, regenerator at step %d: %s", self.context.name, event, told)
+            figures = ", ".join(f"{name} {value:.3g}" for name, value in learnt.items())
+            logger.info("%s, regenerator at step %d: %s", self.context.name, event, figures)
         specs = list(self.planner.specs(run, event, parents))
         views = self.redrawer.redraw_all(run, event, specs)
         views += [

@@ -44,8 +44,8 @@ def span_of(timing: Timing, schedule: Schedule) -> int:
 
 def event_at(step: int, events: Sequence[int], span: int) -> int | None:
     """The event whose window a step (1-based) lies in; windows never outlast the next event."""
-    begun = [event for event in events if event < step]
-    return begun[-1] if begun and step <= begun[-1] + span else None
+    earlier = [event for event in events if event < step]
+    return earlier[-1] if earlier and step <= earlier[-1] + span else None
 
 
 def progress(step: int, event: int, events: Sequence[int], span: int, split: str) -> float:

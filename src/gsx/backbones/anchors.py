@@ -75,7 +75,7 @@ def view_number(numbers: Mapping[Camera, int], views: TrainingViews, camera: Cam
     """Returns the number of the training view with this camera, in the scene or at the step; -1: none."""
     if camera in numbers:
         return numbers[camera]
-    numbered = (pair for shown in (views.full_size, views.at(step)) for pair in enumerate(shown))
+    numbered = (pair for training in (views.full_size, views.at(step)) for pair in enumerate(training))
     return next((number for number, view in numbered if view.camera is camera), -1)
 
 
@@ -159,13 +159,13 @@ class Anchors(SceneModel):
         if not self.schedule.step(growth.observe_from) < step < self.events.stop:
             return {}
         decoded = drawn.decoded
-        seen = densification_statistics(rendering.screen, decoded.slots, weight)
+        on_screen = densification_statistics(rendering.screen, decoded.slots, weight)
         return {
             "rows": drawn.anchors.rows,
             "opacities": decoded.opacities,
-            "slots": seen["rows"],
-            "gradients": seen["gradient"].to(decoded.opacities),
-            "seen": seen["weight"].to(decoded.opacities),
+            "slots": on_screen["rows"],
+            "gradients": on_screen["gradient"].to(decoded.opacities),
+            "visits": on_screen["weight"].to(decoded.opacities),
             "weight": decoded.opacities.new_full((1,), weight),
         }
 

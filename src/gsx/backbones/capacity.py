@@ -128,10 +128,10 @@ class Budget(Capacity):
         views, last = len(self.context.scene.train), self.events.passed(step) == 1
         examined = views if last else min(MOST_VIEWS, views)
         removal = worth_in_training(model, self.context, step, examined)
-        shown = removal.views > 0  # nothing is known of the others: views that were not examined may show them
-        count = excess if examined == views else round(excess * float(shown.double().mean()))
-        kept = torch.ones_like(shown)
-        kept[torch.where(shown, removal.squares, torch.inf).argsort(stable=True)[:count]] = False
+        visible = removal.views > 0  # nothing is known of the others: views that were not examined may show them
+        count = excess if examined == views else round(excess * float(visible.double().mean()))
+        kept = torch.ones_like(visible)
+        kept[torch.where(visible, removal.squares, torch.inf).argsort(stable=True)[:count]] = False
         keep_rows(model.table, kept)
         return {"removed": count}
 

@@ -20,7 +20,7 @@ from gsx.backbones.growth_options import Quirks
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.levels import Levels, drawn, facts_of, initial_nodes, kept, note_of, thresholds, warnings_of
 from gsx.backbones.sampling import sampled_means
-from gsx.backbones.visibility import Shown, Visibility
+from gsx.backbones.visibility import Visibility, VisibleGaussians
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
 from gsx.core.quality.losses import volume_loss
@@ -145,14 +145,14 @@ class VisibleByLevel(Visibility):
             logger.warning("%s", warning)
         return cloud, columns
 
-    def shown(self, table: ParameterTable, camera: Camera, step: int) -> Shown:
+    def visible(self, table: ParameterTable, camera: Camera, step: int) -> VisibleGaussians:
         """Returns Gaussians of the levels that the camera draws, faded by the mode (Octree-GS, set_anchor_mask)."""
         means, level, bias = (table[name] for name in ("means", "level", "bias"))
         mask, weights = drawn(self.levels, means.detach(), level, bias, camera, self.levels.highest(step))
         rows = mask.nonzero()[:, 0]
         values = {name: take_rows(parameter, rows) for name, parameter in table.parameters.items()}
         values |= {name: column[rows] for name, column in table.columns.items()}
-        return Shown(values=values, rows=rows, weights=weights[rows])
+        return VisibleGaussians(values=values, rows=rows, weights=weights[rows])
 
     def columns(self, table: ParameterTable) -> dict[str, Tensor]:
         """Returns levels, and the distance at which the coarsest alone is drawn (GSOctree, save_ply)."""

@@ -39,7 +39,7 @@ class ColourFits:
     """W |c|^2."""
     current: Float[Tensor, "n 3 N"]
     """Coefficients as they are."""
-    shown: Float[Tensor, "N"]
+    views: Float[Tensor, "N"]
     """How many views show the row."""
     error: float
     """Squared error of the views, with that of the rounding of their photographs."""
@@ -51,7 +51,7 @@ def colour_fits(probe: Probe, views: Sequence[View], generator: torch.Generator,
     current = coefficients_of(table, degree)
     count, n = len(table), len(current)
     grams, products = current.new_zeros(n, n, count), current.new_zeros(n, 3, count)
-    norms, shown, error = current.new_zeros(count), current.new_zeros(count), 0.0
+    norms, shows, error = current.new_zeros(count), current.new_zeros(count), 0.0
     for view in views:
         render = probe.render(view.camera)
         weights = weights_of(render, view, draws_per_view(views), generator)
@@ -60,9 +60,9 @@ def colour_fits(probe: Probe, views: Sequence[View], generator: torch.Generator,
         grams += render.by_row(weighted[:, None] * basis)
         products += render.by_row(weighted[:, None] * colours)
         norms += render.by_row(weights * colours.square().sum(0))
-        shown += render.visible_rows()
+        shows += render.visible_rows()
         error += float(probe.squared_error(render.image, view)) + rounding_of(view)
-    return ColourFits(grams=grams, products=products, norms=norms, current=current, shown=shown, error=error)
+    return ColourFits(grams=grams, products=products, norms=norms, current=current, views=shows, error=error)
 
 
 def coefficients_of(table: ParameterTable, degree: int) -> Float[Tensor, "n 3 N"]:

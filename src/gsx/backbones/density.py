@@ -48,14 +48,14 @@ def densification_statistics(
     splats that were rendered; None: splat n is row n.
     """
     visible = screen.visible
-    seen = {
+    observation = {
         "rows": screen.ids if drawn is None else drawn[screen.ids],
         "gradient": torch.where(visible, screen.ndc_gradient(screen.means2d_offset).norm(dim=1), 0.0),
         "weight": visible.to(screen.means2d_offset.dtype) * weight,
     }
     if screen.absgrad is not None:
-        seen["absolute"] = torch.where(visible, screen.ndc_gradient(screen.absgrad).sum(1), 0.0)
-    return seen
+        observation["absolute"] = torch.where(visible, screen.ndc_gradient(screen.absgrad).sum(1), 0.0)
+    return observation
 
 
 def mean_of(sums: Float[Tensor, "*N"], counts: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
@@ -74,13 +74,13 @@ def gradient_statistics(count: int, device: torch.device | str, absolute: bool =
     return {name: torch.zeros(count, device=device) for name in names}
 
 
-def add_statistics(table: ParameterTable, seen: dict[str, Tensor]) -> None:
+def add_statistics(table: ParameterTable, observation: dict[str, Tensor]) -> None:
     """Adds what `densification_statistics` returned for one render."""
-    sums, rows = table.statistics, seen["rows"]
-    sums["gradient"].index_add_(0, rows, seen["gradient"].to(sums["gradient"]))
-    sums["count"].index_add_(0, rows, seen["weight"].to(sums["count"]))
-    if "absolute" in sums and "absolute" in seen:
-        sums["absolute"].index_add_(0, rows, seen["absolute"].to(sums["absolute"]))
+    sums, rows = table.statistics, observation["rows"]
+    sums["gradient"].index_add_(0, rows, observation["gradient"].to(sums["gradient"]))
+    sums["count"].index_add_(0, rows, observation["weight"].to(sums["count"]))
+    if "absolute" in sums and "absolute" in observation:
+        sums["absolute"].index_add_(0, rows, observation["absolute"].to(sums["absolute"]))
 
 
 def zero_statistics(table: ParameterTable) -> None:

@@ -22,11 +22,11 @@ def in_empty_space(positions: Float[Tensor, "P 3"], views: Sequence[View]) -> Bo
     for view in views:
         empty = view.transparent()
         if empty is not None:
-            witnesses += shown_empty(positions, view, empty)
+            witnesses += in_empty_pixel(positions, view, empty)
     return witnesses >= WITNESSES
 
 
-def shown_empty(positions: Float[Tensor, "P 3"], view: View, empty: Bool[Tensor, "H W"]) -> Bool[Tensor, "P"]:
+def in_empty_pixel(positions: Float[Tensor, "P 3"], view: View, empty: Bool[Tensor, "H W"]) -> Bool[Tensor, "P"]:
     """Marks points that a view has in an empty pixel."""
     pixels, depths = view.camera.project(positions)
     inside = view.camera.shows(pixels, depths)

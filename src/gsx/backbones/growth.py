@@ -43,19 +43,19 @@ def observe(
     opacities: Float[Tensor, "A k"],
     slots: Int[Tensor, "M"],
     gradients: Float[Tensor, "M"],
-    seen: Float[Tensor, "M"],
+    visits: Float[Tensor, "M"],
     weight: Float[Tensor, "1"],
 ) -> None:
     """Counts one picture: visits of the anchors in view, and gradient norms of the Gaussians on screen (Scaffold-GS).
 
-    `gradients` are 0 for Gaussians without a radius, as is `seen`, elsewhere the weight; `opacities` are summed over an
-    anchor's offsets. All but gradients, which carry it already, count by the picture's weight in the step's loss
-    (see `backbones.density`): what is compared with numbers of steps sums up to steps, whatever the batch.
+    `gradients` and `visits` are 0 for Gaussians without a radius; elsewhere `visits` is the weight. `opacities` are
+    summed over an anchor's offsets. Everything counts by the picture's weight in the step's loss, which gradients
+    carry already (see `backbones.density`): sums compare with numbers of steps, whatever the batch.
     """
     table["opacity_sum"][rows] += weight * opacities.sum(1)
     table["visits"][rows] += weight
     table["gradient_sum"].view(-1).index_add_(0, slots, gradients)
-    table["gradient_count"].view(-1).index_add_(0, slots, seen)
+    table["gradient_count"].view(-1).index_add_(0, slots, visits)
 
 
 def eligible(table: ParameterTable, least: float) -> tuple[Bool[Tensor, "N k"], Float[Tensor, "N k"]]:

@@ -20,7 +20,7 @@ from gsx.backbones.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.backbones.scene_model import SceneModel
 from gsx.backbones.sh_degrees import ChosenDegrees, choose_degrees, hold_bands, lower_degrees, numbers_of
 from gsx.backbones.sky import NOTHING, SKY_OPACITY, WIDEST, far_away, sky_behind
-from gsx.backbones.visibility import Shown, Visibility, everything, extents
+from gsx.backbones.visibility import Visibility, VisibleGaussians, everything, extents
 from gsx.core.backend import EAGER, Backend
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud
@@ -167,9 +167,9 @@ class GS3D(SceneModel):
 
     def draw(self, camera: Camera, step: int) -> DrawnSplats:
         """Returns the Gaussians that the camera draws, with their colours as seen from there."""
-        shown = self.visibility.shown(self.table, camera, step)
-        values = shown.values
-        scales, log_opacities = extents(self.table, shown, self.filter)
+        visible = self.visibility.visible(self.table, camera, step)
+        values = visible.values
+        scales, log_opacities = extents(self.table, visible, self.filter)
         backend = self.raster.backend.on(scales.device.type, learning=True)
         splats = Splats(
             means=values["means"],
@@ -178,7 +178,7 @@ class GS3D(SceneModel):
             log_opacities=log_opacities,
             colours=colours_from(camera, values, self.active_degree(step), backend),
         )
-        return DrawnSplats(splats=splats, rows=shown.rows)
+        return DrawnSplats(splats=splats, rows=visible.rows)
 
     def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
         """Returns that of density control; 3D-GS has none."""
@@ -247,14 +247,14 @@ class GS3D(SceneModel):
 
     def explicit(self, camera: Camera | None, step: int) -> Gaussians:
         """Returns Gaussians of a splat file: those the camera draws, without a camera all."""
-        shown = everything(self.table) if camera is None else self.visibility.shown(self.table, camera, step)
-        return self.gaussians(shown)
+        visible = everything(self.table) if camera is None else self.visibility.visible(self.table, camera, step)
+        return self.gaussians(visible)
 
-    def gaussians(self, shown: Shown) -> Gaussians:
+    def gaussians(self, visible: VisibleGaussians) -> Gaussians:
         """Returns parameters as in a splat file, the 3D filter fused into scales and opacities (Mip-Splatting)."""
-        raw = {name: shown.values[name].detach() for name in self.table.parameters}
-        if self.filter.note or shown.weights is not None:
-            scales, log_opacities = extents(self.table, shown, self.filter)
+        raw = {name: visible.values[name].detach() for name in self.table.parameters}
+        if self.filter.note or visible.weights is not None:
+            scales, log_opacities = extents(self.table, visible, self.filter)
             raw |= {"log_scales": scales.detach().log(), "opacity_logits": logit_of_log(log_opacities.detach())}
         raw["sh_dc"] = raw["sh_dc"][:, 0]
         raw["quats"] = normalize(raw["quats"], dim=1)

@@ -161,7 +161,7 @@ def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: Lev
         zoom=options.zoom,
         views=views,
     )
-    return levels if options.visible_threshold >= 0 else replace(levels, threshold=mean_seen(points, levels))
+    return levels if options.visible_threshold >= 0 else replace(levels, threshold=mean_drawn_fraction(points, levels))
 
 
 def distance_range(points: Float[Tensor, "P 3"], views: Viewpoints, fraction: float) -> tuple[float, float]:
@@ -188,11 +188,11 @@ def box_of(points: Float[Tensor, "P 3"], extend: float, rule: str) -> tuple[floa
     return start, extend * (high - low)
 
 
-def first_level(count: int, given: int, until: int) -> int:
+def first_level(count: int, first: int, until: int) -> int:
     """Returns the highest level at the start: -1 for half of them (Octree-GS, set_level); all if none waits."""
     if until < 1:
         return count - 1
-    return min(count // 2 if given == -1 else given, count - 1)
+    return min(count // 2 if first == -1 else first, count - 1)
 
 
 def base_layer(box: float, count: int, options: LevelOptions, pixels: float) -> int:
@@ -208,10 +208,10 @@ def base_layer(box: float, count: int, options: LevelOptions, pixels: float) -> 
     return min(chosen, max(0, math.floor(math.log(box * pixels / options.cell_pixels, options.fork) + 1e-9)))
 
 
-def mean_seen(points: Float[Tensor, "P 3"], levels: Levels) -> float:
+def mean_drawn_fraction(points: Float[Tensor, "P 3"], levels: Levels) -> float:
     """Returns the adaptive threshold: mean fraction of cameras that draw a node (Octree-GS), held below 1."""
     positions, of, _ = all_nodes(points, levels)
-    return min(float(seen_fraction(levels, positions, of).double().mean()), BELOW_ONE)
+    return min(float(drawn_fraction(levels, positions, of).double().mean()), BELOW_ONE)
 
 
 def all_nodes(
@@ -251,7 +251,7 @@ def whole_level(ideal: Float[Tensor, "M"], mode: str, highest: int) -> tuple[Int
     return rounded.clamp(0, highest).long(), torch.ones_like(ideal)
 
 
-def seen_fraction(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) -> Float[Tensor, "M"]:
+def drawn_fraction(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) -> Float[Tensor, "M"]:
     """Returns the share of training cameras that would draw each primitive, by distance (Octree-GS, weed_out)."""
     views, counts = levels.views, torch.zeros_like(positions[:, 0])
     for centre, coarseness in zip(views.centres, views.coarseness.tolist(), strict=True):
@@ -264,7 +264,7 @@ def kept(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) 
     """Marks primitives that enough training cameras draw (Octree-GS, weed_out); none without a finite place."""
     placed = torch.isfinite(positions).all(1)
     places = torch.where(placed[:, None], positions, 0.0)
-    return (seen_fraction(levels, places, of) > levels.threshold) & placed
+    return (drawn_fraction(levels, places, of) > levels.threshold) & placed
 
 
 def drawn(

@@ -92,12 +92,12 @@ class Densities:
 def densities(rows: Rows, colours: Float[Tensor, "N 3"]) -> Densities:
     """Returns densities of Gaussians with these colours, and one of 1: the dark covers, too."""
     opacities = rows["opacity_logits"].double().sigmoid()[:, None]
-    seen = torch.cat([colours.double(), torch.ones_like(opacities)], 1)
+    channels = torch.cat([colours.double(), torch.ones_like(opacities)], 1)
     double = {name: rows[name].double() for name in PARAMETERS}
     spread = covariances(double)
     least = LEAST_RATIO * spread.diagonal(dim1=1, dim2=2).sum(1) + LEAST_VARIANCE
     solid = spread + least[:, None, None] * torch.eye(3, dtype=spread.dtype, device=spread.device)
-    return Densities(means=double["means"], covariances=solid, amplitudes=opacities * seen)
+    return Densities(means=double["means"], covariances=solid, amplitudes=opacities * channels)
 
 
 def products(a: Densities, b: Densities) -> Float[Tensor, "P"]:

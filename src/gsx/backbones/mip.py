@@ -45,7 +45,7 @@ class MipOptions:
     margin: Annotated[float, Range(0, 100)]
     """Fraction of the raster beside it in which a camera still counts as seeing a point."""
     near: Annotated[float, Range(0, 1e6)]
-    """Points nearer than this count as not seen, scene units."""
+    """Points nearer than this count as not visible, scene units."""
     every: Interval
     """Published steps between updates of the 3D filter after density control, every event of which updates it too."""
     stop: Steps
@@ -144,7 +144,7 @@ class MipFilter(Filter):
         if options.views > 1:
             sizes = sizes / several_views(points, cameras, sizes, options)
         if options.pseudo:
-            earn(table, points, self.new_views, sizes, options)
+            narrow_by_pseudo_views(table, points, self.new_views, sizes, options)
             sizes = sizes.minimum(table["earned"])
         table.columns["filter"] = sizes
 
@@ -194,7 +194,7 @@ def checked_filter(name: str) -> None:
         raise ValueError(f"backbone.filter is '{name}'; choose one of {', '.join(FILTERS)}")
 
 
-def seen_depths(
+def visible_depths(
     points: Float[Tensor, "N 3"], camera: Camera, options: MipOptions
 ) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
     """Returns (depth z, whether the camera counts as seeing the point) (Mip-Splatting, compute_3D_filter)."""
@@ -220,19 +220,19 @@ def filter_sizes(points: Float[Tensor, "N 3"], cameras: Sequence[Camera], option
     nearest = torch.full_like(points[:, 0], torch.inf)
     focal = max(camera.fx for camera in cameras)
     for camera in cameras:
-        depth, seen = seen_depths(points, camera, options)
+        depth, visible = visible_depths(points, camera, options)
         if options.rate == "paper":  # as far away as a camera of the largest focal length would be that is as fine
             depth = depth * (focal / camera.fx)
-        nearest = torch.where(seen, nearest.minimum(depth), nearest)
-    seen = torch.isfinite(nearest)
-    if len(points) and not bool(seen.any()):
+        nearest = torch.where(visible, nearest.minimum(depth), nearest)
+    visible = torch.isfinite(nearest)
+    if len(points) and not bool(visible.any()):
         raise InputError(
             f"none of {len(points)} primitives is seen by any of {len(cameras)} training cameras, so "
             "backbone.filter=mip knows no resolution: check that points and cameras belong together, or do without the "
             "filters by backbone.filter=none"
         )
-    farthest = nearest[seen].max() if len(points) else nearest.new_zeros(())
-    return torch.where(seen, nearest, farthest) / focal * options.variance**0.5
+    farthest = nearest[visible].max() if len(points) else nearest.new_zeros(())
+    return torch.where(visible, nearest, farthest) / focal * options.variance**0.5
 
 
 @torch.no_grad()
@@ -258,12 +258,12 @@ def several_views(
     """
     views, deviation = torch.zeros_like(sizes), options.variance**0.5
     for camera in cameras:
-        depth, seen = seen_depths(points, camera, options)
-        views += seen * (sizes / deviation * camera.fx / depth).square().clamp_max(1)
+        depth, visible = visible_depths(points, camera, options)
+        views += visible * (sizes / deviation * camera.fx / depth).square().clamp_max(1)
     return (views.sqrt() / ENOUGH_VIEWS**0.5).clamp(1, options.views)
 
 
-def earn(
+def narrow_by_pseudo_views(
     table: ParameterTable,
     points: Float[Tensor, "N 3"],
     views: Sequence[PseudoView],
@@ -273,12 +273,12 @@ def earn(
     """Lowers the column `earned` to the smallest size that pseudo views have allowed; infinite where none has."""
     earned = table.columns.get("earned", torch.full_like(sizes, torch.inf))
     for view in views:
-        earned = earned.minimum(earned_size(points, view, sizes, options))
+        earned = earned.minimum(pseudo_view_sizes(points, view, sizes, options))
     table.columns["earned"] = earned
 
 
 @torch.no_grad()
-def earned_size(
+def pseudo_view_sizes(
     points: Float[Tensor, "N 3"], view: PseudoView, sizes: Float[Tensor, "N"], options: MipOptions
 ) -> Float[Tensor, "N"]:
     """Returns the filter of what a pseudo view sees; infinite where it sees nothing.
@@ -289,10 +289,10 @@ def earned_size(
     camera = view.camera
     places, depth = camera.project(points)
     inside = (places >= 0) & (places < places.new_tensor(camera.size))
-    seen = inside.all(1) & (depth > options.near)
+    visible = inside.all(1) & (depth > options.near)
     own = depth.clamp_min(LEAST_DEPTH) / camera.fx * options.variance**0.5
     trust = torch.ones_like(sizes)
     if view.pixel_weight is not None:
         column, row = (places[:, k].long().clamp(0, side - 1) for k, side in enumerate(camera.size))
         trust = view.pixel_weight.to(sizes)[row, column] / 255
-    return torch.where(seen, sizes * (own / sizes).clamp_max(1).pow(trust), torch.inf)
+    return torch.where(visible, sizes * (own / sizes).clamp_max(1).pow(trust), torch.inf)

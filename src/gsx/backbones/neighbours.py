@@ -94,10 +94,10 @@ def candidates(
     numbers = ((points.double() / cell).floor().long() * strides).sum(1)
     sorted_numbers, order = numbers.sort(stable=True)
     steps = torch.cartesian_prod(*[torch.tensor([-1, 0, 1], device=points.device)] * 3)
-    wanted = (numbers[rows, None] + (steps * strides).sum(1)).flatten()
-    first = torch.searchsorted(sorted_numbers, wanted)
-    lengths = torch.searchsorted(sorted_numbers, wanted, right=True) - first
-    slot = torch.repeat_interleave(torch.arange(len(wanted), device=points.device), lengths)
+    targets = (numbers[rows, None] + (steps * strides).sum(1)).flatten()
+    first = torch.searchsorted(sorted_numbers, targets)
+    lengths = torch.searchsorted(sorted_numbers, targets, right=True) - first
+    slot = torch.repeat_interleave(torch.arange(len(targets), device=points.device), lengths)
     within = torch.arange(len(slot), device=points.device) - (lengths.cumsum(0) - lengths)[slot]
     owner, candidate = slot // len(steps), order[first[slot] + within]
     other = candidate != rows[owner]

@@ -42,7 +42,7 @@ def numbers_of(degree: int, other: int) -> Int[Tensor, "D"]:
 
 def least_degrees(
     squares: Float[Tensor, "D N"],
-    shown: Float[Tensor, "N"],
+    views: Float[Tensor, "N"],
     error_share: float,
     price: float,
     numbers: Int[Tensor, "D"],
@@ -54,7 +54,7 @@ def least_degrees(
     """
     share = (numbers / numbers[-1]).to(squares)
     cost = squares + error_exponent(price) * error_share * share[:, None]
-    return torch.where(shown > 0, cost.argmin(0), len(numbers) - 1)
+    return torch.where(views > 0, cost.argmin(0), len(numbers) - 1)
 
 
 def kept_bands(degrees: Int[Tensor, "N"], count: int) -> Bool[Tensor, "N B"]:
@@ -68,8 +68,8 @@ def choose_degrees(fits: ColourFits, price: float, numbers: Int[Tensor, "D"]) ->
     highest = len(numbers) - 1
     lower = [fitted(fits, degree) for degree in range(highest)]
     squares = torch.stack([squared_change(fits, one) for one in lower] + [torch.zeros_like(fits.norms)])
-    share = fits.error / max(1.0, float(fits.shown.sum()))
-    degrees = least_degrees(squares / fits.shown.clamp_min(1), fits.shown, share, price, numbers)
+    share = fits.error / max(1.0, float(fits.views.sum()))
+    degrees = least_degrees(squares / fits.views.clamp_min(1), fits.views, share, price, numbers)
     coefficients = torch.zeros_like(fits.current)
     for degree, one in enumerate(lower):
         coefficients[: len(one)] += one * (degrees == degree)

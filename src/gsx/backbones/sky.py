@@ -90,9 +90,9 @@ def sky_of(scene: Scene) -> Sky:
     """Returns the directions that open pixels of training views look in, with the colours they show."""
     up, cells = upwards(scene.train), directions(CELLS)
     count, colour, total = torch.zeros(CELLS), torch.zeros(CELLS, 3), 0
-    for cell, shown, pixels in open_views(scene, up, cells):
+    for cell, values, pixels in open_views(scene, up, cells):
         count.index_add_(0, cell, torch.ones(len(cell)))
-        colour.index_add_(0, cell, shown)
+        colour.index_add_(0, cell, values)
         total += pixels
     open_cells = count >= LEAST_PIXELS
     centre, radius = centre_of(scene.train), radius_of(scene)
@@ -154,8 +154,8 @@ def none_above(
     columns = max(int(of_pixels[:, 0].max()), int(of_points[:, 0].max())) - first + 2
     highest = torch.full((columns,), -(2**40)).scatter_reduce_(0, of_points[:, 0] - first, of_points[:, 1], "amax")
     column = of_pixels[:, 0] - first
-    beside = torch.stack([highest[column + side] for side in (-1, 0, 1)]).amax(0)
-    return of_pixels[:, 1] > beside + 1
+    neighbours = torch.stack([highest[column + side] for side in (-1, 0, 1)]).amax(0)
+    return of_pixels[:, 1] > neighbours + 1
 
 
 # -- cameras and directions --------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ LEAST_WEIGHT = 1e-37
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Shown:
+class VisibleGaussians:
     """Parameters of what a camera draws of N Gaussians."""
 
     values: dict[str, Tensor]
@@ -30,18 +30,20 @@ class Shown:
     """Factors of the opacities; None: 1."""
 
 
-def everything(table: ParameterTable) -> Shown:
+def everything(table: ParameterTable) -> VisibleGaussians:
     """Returns all Gaussians."""
-    return Shown(values={**table.parameters, **table.columns})
+    return VisibleGaussians(values={**table.parameters, **table.columns})
 
 
-def extents(table: ParameterTable, shown: Shown, filter_: Filter) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
+def extents(
+    table: ParameterTable, visible: VisibleGaussians, filter_: Filter
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
     """Returns scales and log-opacities as they are drawn, after the 3D filter if there is one."""
-    scales = shown.values["log_scales"].clamp(max=LARGEST_LOG_SCALE).exp()
-    log_opacities = logsigmoid(shown.values["opacity_logits"])
-    if shown.weights is not None:
-        log_opacities = log_opacities + shown.weights.clamp_min(LEAST_WEIGHT).log()
-    return filter_.smoothed(scales, log_opacities, table, shown.rows)
+    scales = visible.values["log_scales"].clamp(max=LARGEST_LOG_SCALE).exp()
+    log_opacities = logsigmoid(visible.values["opacity_logits"])
+    if visible.weights is not None:
+        log_opacities = log_opacities + visible.weights.clamp_min(LEAST_WEIGHT).log()
+    return filter_.smoothed(scales, log_opacities, table, visible.rows)
 
 
 class Visibility:
@@ -53,7 +55,7 @@ class Visibility:
         """Returns (one point for each Gaussian at the start, columns of the table)."""
         return points, {}
 
-    def shown(self, table: ParameterTable, camera: Camera, step: int) -> Shown:
+    def visible(self, table: ParameterTable, camera: Camera, step: int) -> VisibleGaussians:
         """Returns what the camera draws."""
         return everything(table)
 

@@ -188,7 +188,7 @@ def splats_of_primitive(asset: Asset, primitive: Entry, name: str) -> Arrays:
         arrays, _ = decode_spz(content)  # a node turns them, not their format
     else:
         attributes = part_of(primitive, "attributes")
-        found = {key: values_of(asset, attributes[key]) for key in wanted(attributes)}
+        found = {key: values_of(asset, attributes[key]) for key in splat_attributes(attributes)}
         refuse_shapes(found)
         arrays = arrays_of_attributes(finite_rows(found, name))
     for key, usual in {"kernel": RULES["kernel"], "colorSpace": SRGB}.items():
@@ -219,7 +219,7 @@ def refuse_other_rules(options: Entry) -> None:
         raise InputError(f"its splats need '{others[0][:60]}', which is not read: export them without")
 
 
-def wanted(attributes: Entry) -> list[str]:
+def splat_attributes(attributes: Entry) -> list[str]:
     """Returns the attributes that splats are read from; others, such as COLOR_0, repeat them."""
     missing = [name for name in REQUIRED if name not in attributes]
     if missing:

@@ -35,8 +35,8 @@ def turned_harmonics(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tenso
     Bands turn within themselves (Wigner), so that a least-squares fit over many directions is exact.
     """
     directions = spread_directions(DIRECTIONS)
-    seen = harmonics(directions @ rotation, degree)
-    return torch.linalg.lstsq(harmonics(directions, degree), seen).solution
+    rotated = harmonics(directions @ rotation, degree)
+    return torch.linalg.lstsq(harmonics(directions, degree), rotated).solution
 
 
 def spread_directions(count: int) -> Float[Tensor, "count 3"]:
