@@ -12,10 +12,10 @@ from small_scene import small_scene, spread
 from tiny import LIGHT, final_tensors, stopped_at, tiny_run
 from torch import Tensor
 
-from gsx.backbones.anchor_grids import LevelGrids
+from gsx.backbones.anchor_grids import LevelGrids, automatic_voxel, voxel_nodes
 from gsx.backbones.anchor_options import Decay
-from gsx.backbones.anchors import Anchors, DrawnAnchors
-from gsx.backbones.voxels import automatic_voxel, voxel_nodes
+from gsx.backbones.anchors import Anchors
+from gsx.backbones.decoding import DrawnAnchors
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import Scene
@@ -331,7 +331,7 @@ def test_an_empty_picture_is_a_picture(name: str) -> None:
         assert regulariser is None or float(regulariser.detach()) == 0
         assert all(not gradient.any() for gradient in gradients(model.table).values())
         model.accumulate(model.observe(drawn, rendering, 1000))
-        assert model.table["visits"].sum() == len(drawn.anchors.rows)
+        assert model.table["visits"].sum() == len(drawn.anchors)
         assert model.densify_and_prune(1000) == {}
         model.update(1000)
         assert all(torch.isfinite(value).all() for value in table_tensors(model.table).values())
@@ -362,16 +362,15 @@ def test_statistics_are_nested_as_in_a_loop(name: str) -> None:
     wanted = [[0.0] * count, [0.0] * count, [0.0] * count * k, [0.0] * count * k]
     for camera in cameras_of(backbone)[:2]:
         drawn, rendering = render(backbone, camera, 1000)
-        decoded = drawn.decoded
-        opacity_of = dict(zip(decoded.slots.tolist(), decoded.splats.log_opacities.exp().tolist(), strict=True))
-        for row in drawn.anchors.rows.tolist():
+        opacity_of = dict(zip(drawn.slots.tolist(), drawn.splats.log_opacities.exp().tolist(), strict=True))
+        for row in drawn.anchors.tolist():
             wanted[0][row] += 1
             wanted[1][row] += sum(opacity_of.get(row * k + j, 0.0) for j in range(k))
         screen = rendering.screen
         for place, splat in enumerate(screen.ids.tolist()):
             if int(screen.radii[place]) > 0:
                 x, y = screen.means2d_offset.grad[place].tolist()
-                slot = int(decoded.slots[splat])
+                slot = int(drawn.slots[splat])
                 wanted[2][slot] += math.hypot(x * camera.width / 2, y * camera.height / 2)
                 wanted[3][slot] += 1
         backbone.accumulate(backbone.observe(drawn, rendering, 1000))

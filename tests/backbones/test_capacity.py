@@ -222,7 +222,7 @@ def test_a_run_without_an_event_is_told_that_nothing_is_decided(capacity: str, p
     scene = small_scene(spread(20), views=30)
     options = options_of(capacity, budget=BudgetOptions(primitives=10 * (capacity == "budget")))
     plan = small_gs3d(scene, options=options, iterations=40).plan()
-    assert plan[part]["caution"].startswith("decides nothing, as density control acts at no step of this run, every 30")
+    assert plan[part]["caution"].startswith("has no effect: density control acts at no step of this run, every 30")
     assert "caution" not in small_gs3d(scene, options=options, iterations=400).plan()[part]
 
 

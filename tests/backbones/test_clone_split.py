@@ -334,7 +334,7 @@ def test_fidelity_reaches_every_switch_of_the_second_form() -> None:
         found[fidelity] = (quirks.gate, quirks.bias, levels.extend_rule, levels.half_cell)
     assert found == {"reference": ("open", "level", "reference", True), "sane": ("closed", "own", "sane", False)}
     with pytest.raises(
-        ConfigError, match=r"quirks\.promoted is 'max', which means nothing to densification=clone_split"
+        ConfigError, match=r"quirks\.promoted is 'max', which has no effect on densification=clone_split"
     ):
         options_of("quirks.promoted=max")
 
@@ -479,7 +479,7 @@ def test_a_view_as_a_standard_file_draws_the_same_picture(mode: str) -> None:
     (("clone_split=null",), "clone_split is null"),
     (("clone_split.level_density.shrink=0",), "give 0 < shrink <= 1"),
     (("clone_split.level_density.bias_step=-1",), "give a number from 0"),
-    (("clone_split.density.absolute=true",), "does not know"),
+    (("clone_split.density.absolute=true",), "levels do not support it"),
     (("levels.coarse_until=40000",), "would never train"),
 ])  # fmt: skip
 def test_options_are_checked(words: tuple[str, ...], complaint: str) -> None:

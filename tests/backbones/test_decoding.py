@@ -10,7 +10,7 @@ from test_heads import SMALL, heads_of
 from torch import Tensor
 from torch.nn import Parameter
 
-from gsx.backbones.decoding import Decoded, Explicit, Neural, VisibleAnchors, baked
+from gsx.backbones.decoding import DrawnAnchors, Explicit, Neural, VisibleAnchors, baked
 from gsx.backbones.heads import Heads
 from gsx.backbones.mip import Filter, MipFilter, MipOptions
 from gsx.core.data.camera import Camera, look_at
@@ -82,7 +82,7 @@ def fixed_outputs(opacities: list[list[float]]) -> Fixed:
     return Fixed(torch.tensor(opacities), shapes, torch.arange(rows * k * 3).reshape(rows, k, 3) / 100 + 0.01)
 
 
-def check_against_loop(decoded: Decoded, table: ParameterTable, heads: Fixed, drawn: VisibleAnchors) -> None:
+def check_against_loop(decoded: DrawnAnchors, table: ParameterTable, heads: Fixed, drawn: VisibleAnchors) -> None:
     """Which Gaussians there are, in which order, with which values: one anchor and offset after the other."""
     opacities, shapes, colours = (output.tolist() for output in heads.outputs)
     offsets, lengths = table["offsets"].tolist(), table["log_scales"].exp().tolist()
@@ -170,7 +170,7 @@ def test_a_camera_at_an_anchor_decodes_finite_values() -> None:
     assert all(torch.isfinite(getattr(splats, name)).all() for name in FIELDS)
 
 
-def decoded_values(decoded: Decoded) -> tuple[Tensor, ...]:
+def decoded_values(decoded: DrawnAnchors) -> tuple[Tensor, ...]:
     return tuple(getattr(decoded.splats, name) for name in FIELDS)
 
 

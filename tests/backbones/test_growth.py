@@ -82,7 +82,7 @@ def deepen(
 ) -> int:
     generator = torch.Generator().manual_seed(9)
     options = replace(PUBLISHED, **changes)
-    return DepthGrowth(table, representation, options, 40.0, under(most, table), voxel).grow(voxel, early, generator)[0]
+    return DepthGrowth(table, representation, options, 40.0, under(most, table), voxel).grow(early, generator)[0]
 
 
 def grown(table: ParameterTable, before: int) -> list[tuple[float, ...]]:
@@ -303,8 +303,8 @@ def level_up(
     quirks = replace(REFERENCE, **{name: value for name, value in changes.items() if name in CHOICES})
     options = replace(PUBLISHED, **{name: value for name, value in changes.items() if name not in CHOICES})
     levels = levels or three_levels()
-    event = LevelGrowth(table, representation, options, 40.0, under(most, table), levels.size(levels.count - 1))
-    return event.grow(levels, quirks, gate)[0]
+    room = under(most, table)
+    return LevelGrowth(table, representation, options, 40.0, room, levels, quirks, gate).grow()[0]
 
 
 def grown_levels(table: ParameterTable, before: int) -> list[tuple]:

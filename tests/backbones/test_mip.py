@@ -200,7 +200,7 @@ def test_sizes_are_those_of_a_loop_over_points_and_cameras(seed: int) -> None:
 
 
 def test_where_nothing_is_seen_the_error_says_what_to_do() -> None:
-    with pytest.raises(InputError, match=r"none of 3 primitives is seen by any of 2 .*backbone\.filter=none"):
+    with pytest.raises(InputError, match=r"none of 3 primitives is visible in any of 2 .*backbone\.filter=none"):
         filter_sizes(torch.tensor([[0.0, 0, -1.0]] * 3), [axis_camera()] * 2, OPTIONS)
 
 

@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsx.backbones.sky import DISTANCE, directions, none_above, sky_of
+from gsx.backbones.sky import CELLS, DISTANCE, none_above, sky_of
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene, View
+from gsx.formats.turned import spread_directions
 
 LOWEST = 0.1
 """Sine of the elevation above which nothing of the scene is seen."""
@@ -141,7 +142,7 @@ def shifted(camera: Camera, by: Tensor) -> Tensor:
 
 
 def test_directions_are_evenly_over_the_sphere() -> None:
-    found = directions(8000)
+    found = spread_directions(CELLS).float()
     assert torch.allclose(found.norm(dim=1), torch.ones(8000))
     assert found.mean(0).abs().max() < 1e-3
     nearest = (found[::40] @ found.T).topk(2).values[:, 1].clamp(max=1).acos()

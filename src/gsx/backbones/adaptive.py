@@ -1,12 +1,10 @@
-"""As many primitives as pay for themselves: growth goes on while validation windows say so.
+"""Adaptive capacity: growth continues while new primitives raise validation PSNR by more than their price.
 
-Between two events of density control a window of some training views counts in no loss. The next event draws them
-twice: by the model as it is, and as it would be had the last event added nothing. The difference of the errors is the
-gain of what was added, in dB per doubling of the primitives, the unit of the price. Growth is faster the more it gains,
-and ends where that stays below the price. Then what is not worth the price is removed: at the events after as long as
-much goes, and at the last one.
-No step has seen the windows since what they measure was added. They move to other views and places with every event, so
-that all pixels are learnt from in the end. Test views play no part.
+Between two events of density control, windows of some training views are held out of the loss. The next event renders
+them with and without the primitives that the last event added. The difference of the squared errors is the gain, in dB
+per doubling of the primitives, the unit of the price. A larger gain makes growth faster; below the price growth ends,
+and primitives worth less than the price are removed. The windows change with every event, so training still uses all
+pixels; test views are never read.
 """
 
 import logging
@@ -41,57 +39,40 @@ from gsx.core.training.validation import decibels, rounding_in, validation_windo
 logger = logging.getLogger(__name__)
 
 SLOWER, FASTER = 0.5, 2.0
-"""By how much the rate of growth changes from one event to the next, at most."""
+"""Least and largest factor between the growth rates of two events."""
 STEPS = 100
-"""Rates of growth hold for so many: the more training views there are, the farther apart events are."""
+"""Steps that a growth rate refers to: the distance of events depends on the number of training views."""
 AT_ONCE = 0.75
-"""Largest share of the rows that is removed at once: each is measured beside all others, though together they may be
-worth much. What is left learns before the next removal."""
+"""Largest share of the rows removed in one event: each is measured alone, but together they may be worth much."""
 AGAIN = 0.1
-"""Once growth has ended, events go on removing while the last one removed such a share."""
+"""After growth, events continue to remove rows while the last one removed at least this share."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptiveOptions:
-    """Growth while it pays; values in conf/backbone/parts/capacity.yaml."""
+    """Options of adaptive growth; values in conf/backbone/parts/capacity.yaml."""
 
     price: Annotated[float, Range(1e-6, 100)] = 0.8
-    """dB that a doubling of the primitives has to bring in the end."""
+    """Least gain of a doubling of the primitives at the end of the run, dB."""
     discount: Annotated[float, Range(1e-6, 1)] = 0.2
-    """Share of gains and errors measured during growth that is left in the end: other primitives count on the new ones,
-    nothing has learnt without them, and learning goes on."""
+    """Share of a gain or error measured during growth that remains at the end of the run."""
     judged: bool = True
-    """Whether what each event gains decides how fast growth goes on. Otherwise growth is as published, and what is not
-    worth the price is removed: for primitives that become useful only later (anchors)."""
+    """True: the gain of each event sets the growth rate. False: published growth, then primitives worth less than the
+    price are removed; for primitives that become useful late (anchors)."""
     rate: Annotated[float, Range(1e-6, 10)] = 0.15
-    """Growth over a hundred steps, at first."""
+    """Initial growth per hundred steps."""
     fastest: Annotated[float, Range(1e-6, 10)] = 0.4
-    """Over a hundred steps, whatever is gained."""
+    """Largest growth per hundred steps."""
     slowest: Annotated[float, Range(1e-6, 10)] = 0.025
-    """Growth that slows down to less over a hundred steps has ended."""
+    """Growth per hundred steps below which growth ends."""
     views: Annotated[int, Range(1, 1000)] = 6
-    """Training views that have a validation window at a time."""
+    """Training views with a validation window at a time."""
     window: Annotated[float, Range(0.05, 1)] = 0.5
-    """Its sides as shares of the view's."""
-
-
-@dataclass(frozen=True)
-class Trial:
-    """The gain of the primitives that one event added, measured at the event after it."""
-
-    step: int
-    primitives: int
-    added: int
-    gain: float
-    """dB per doubling, discounted."""
-    error: float
-    """Its standard error over the windows."""
-    rate: float
-    """Growth from here on, over a hundred steps."""
+    """Sides of a window as shares of the view's."""
 
 
 class Adaptive(Capacity):
-    """Grows while what each event has added gains more than its price."""
+    """Growth that continues while each event gains more than its price."""
 
     ranked = True
 
@@ -100,13 +81,14 @@ class Adaptive(Capacity):
         self.options, self.context, self.events = options, context, events
 
     def initialise(self, table: ParameterTable) -> None:
-        """Gives a fresh table its statistic and its record."""
+        """Adds the statistic and the record that adaptive capacity keeps in a table."""
         table.statistics["born"] = torch.zeros(len(table), device=table.device)
+        # of each measured event: step, primitives, added, gain and its standard error (dB per doubling), next rate
         table.record["trials"] = torch.zeros(0, 6, dtype=torch.float64)
         table.record["removed_share"] = torch.zeros((), dtype=torch.float64)
 
     def remove_empty(self, table: ParameterTable, positions: Float[Tensor, "N 3"]) -> dict[str, float]:
-        """Removes what lies where photos show that nothing is: most of random points."""
+        """Removes rows in space that photos show to be empty: most of random points."""
         empty = in_empty_space(positions.detach(), self.context.scene.train) & not_sky(table)
         count = int(empty.sum())
         if count in (0, len(empty)):
@@ -118,12 +100,12 @@ class Adaptive(Capacity):
     # -- validation windows --------------------------------------------------------------------------------------
 
     def windows(self, step: int) -> dict[View, Window]:
-        """Returns the windows that count in no loss at a step: those of its interval between events."""
+        """Returns the windows held out of the loss at a step: those of its interval between events."""
         views, interval = self.context.views.at(step), (step - 1) // self.events.every
         return validation_windows(views, self.options.views, self.options.window, "withheld", interval)
 
     def validation_window(self, table: ParameterTable, view: View, step: int) -> Window | None:
-        """Returns that of the interval which the step belongs to, while there is something to measure."""
+        """Returns the view's held-out window at a step, while events are measured."""
         if not self.events.start < step < self.events.stop or not self.measures(table):
             return None
         return self.windows(step).get(view)
@@ -131,10 +113,7 @@ class Adaptive(Capacity):
     # -- evaluation ----------------------------------------------------------------------------------------------
 
     def evaluate(self, model: Backbone[Any], before_last_event: BeforeLastEvent, step: int) -> dict[str, float]:
-        """Measures the gain of the primitives that the last event added, and removes what is not worth the price.
-
-        Rows are removed when growth ends, at the last event, and in between while that makes the model much smaller.
-        """
+        """Measures the gain of the last event; when growth ends and at the last event, removes rows below the price."""
         grew = not self.ended(model.table)
         metrics = self.measure(model, before_last_event, step)
         last = self.events.passed(step) == 1
@@ -146,26 +125,29 @@ class Adaptive(Capacity):
         return metrics | ({"withheld": over_cap} if over_cap > 0 and self.options.judged else {})
 
     def measure(self, model: Backbone[Any], before_last_event: BeforeLastEvent, step: int) -> dict[str, float]:
-        """Draws the validation windows with and without what the last event added."""
+        """Renders the validation windows with and without the primitives of the last event."""
         table = model.table
         before = before_last_event(table) if self.measures(table) else None
-        if before is None or not bool(rounding_in(self.windows(step)).any()):  # masked windows tell nothing
+        if before is None or not bool(rounding_in(self.windows(step)).any()):  # all windows are masked
             return {}
-        gain, error = self.gain(model, table, before, step)
         each = self.options.discount / math.log2(len(table) / len(before))
-        rate = self.rate(table) * min(FASTER, max(SLOWER, each * gain / self.options.price))
-        added = len(table) - len(before)
-        trial = Trial(step, len(table), added, each * gain, each * error, min(rate, self.options.fastest))
-        row = torch.tensor([list(vars(trial).values())], dtype=torch.float64)
-        table.record["trials"] = torch.cat([table.record["trials"], row])
-        self.log(trial, table)
-        spread = {"gain_error": trial.error} if math.isfinite(trial.error) else {}  # of one window there is none
-        return {"judged": len(table), "gain": trial.gain, "price": self.options.price} | spread
+        gain, error = (each * value for value in self.gain(model, table, before, step))
+        price, added = self.options.price, len(table) - len(before)
+        rate = min(self.rate(table) * min(FASTER, max(SLOWER, gain / price)), self.options.fastest)
+        trial = torch.tensor([[step, len(table), added, gain, error, rate]], dtype=torch.float64)
+        table.record["trials"] = torch.cat([table.record["trials"], trial])
+        decision = "growth ends" if self.ended(table) else f"growth continues by {self.share(table):.1%}"
+        logger.info(
+            "step %d: the last %d primitives gained %.2f +- %.2f dB per doubling, price %.2f: %s at %d primitives",
+            *(step, added, gain, error, price, decision, len(table)),
+        )
+        spread = {"gain_error": error} if math.isfinite(error) else {}  # infinite for one window
+        return {"judged": len(table), "gain": gain, "price": price} | spread
 
     def gain(
         self, model: Backbone[Any], table: ParameterTable, before: ParameterTable, step: int
     ) -> tuple[float, float]:
-        """Returns (dB by which a table draws validation windows better than another, its standard error)."""
+        """Returns (gain of a table over `before` in the validation windows, its standard error), dB."""
         windows = self.windows(step)
         floor, probe = rounding_in(windows), Probe(model=model, views=self.context.views, step=step)
 
@@ -176,10 +158,9 @@ class Adaptive(Capacity):
         return self.context.on_rank0(measure)
 
     def remove_idle_levels(self, model: Backbone[Any], step: int) -> dict[str, float]:
-        """Removes the finest levels of detail while they gain less than the price; returns the gains of all.
+        """Removes the finest levels of detail that gain less than the price; returns the gain of each, dB per doubling.
 
-        A level's gain is what validation windows lose without its primitives, in dB per doubling. A level that no
-        window shows is kept: others may, and nothing is known of it.
+        A level that no window shows has gain 0 and stays: other views may show it.
         """
         if "level" not in model.table.columns:
             return {}
@@ -202,17 +183,16 @@ class Adaptive(Capacity):
         return gains | {"levels_removed": removed}
 
     def gain_of_rows(self, model: Backbone[Any], rows: Bool[Tensor, "N"], step: int) -> float:
-        """Returns the dB per doubling of the primitives that validation windows lose without these, discounted."""
+        """Returns the loss of the validation windows without these rows, dB per doubling, discounted."""
         without = with_rows(model.table, ~rows)
         doublings = math.log2(len(model.table) / len(without))
         return self.options.discount * self.gain(model, model.table, without, step)[0] / doublings
 
     def remove_idle_rows(self, model: Backbone[Any], step: int) -> dict[str, float]:
-        """Removes rows without which the error of the training views would grow by less than their share of the price.
+        """Removes rows whose removal raises the squared error of training views by less than their share of the price.
 
-        A view that shows N rows may lose lambda / (N ln 2) dB with one of them, lambda being the price: lambda ln 10 /
-        (10 N ln 2) of its squared error, as that will be in the end, with that of the photo's rounding. A row's worth
-        is the mean over the views that show it; those worth least go first, at most three quarters of all at once.
+        A view that shows N rows may lose price / (N ln 2) dB with each, which is price ln 10 / (10 N ln 2) of its final
+        squared error, rounding of the photo included. The least important rows go first, at most `AT_ONCE` of all.
         """
         removal = worth_in_training(model, self.context, step)
         lasting = self.options.discount * removal.error_share + removal.rounding_share
@@ -229,23 +209,15 @@ class Adaptive(Capacity):
         keep_rows(model.table, kept)
         return {"removed": count}
 
-    def log(self, trial: Trial, table: ParameterTable) -> None:
-        """Logs what was decided, because of which number and threshold."""
-        verdict = "growth ends" if self.ended(table) else f"growth goes on by {self.share(table):.1%}"
-        logger.info(
-            "step %d: the last %d primitives gained %.2f +- %.2f dB per doubling, price %.2f: %s at %d primitives",
-            *(trial.step, trial.added, trial.gain, trial.error, self.options.price, verdict, trial.primitives),
-        )
-
     # -- the rate of growth --------------------------------------------------------------------------------------
 
     def rate(self, table: ParameterTable) -> float:
-        """Returns the growth over a hundred steps: more while a doubling gains more than its price."""
+        """Returns the growth per hundred steps after the last measured event."""
         trials = table.record["trials"]
         return float(trials[-1, 5]) if len(trials) else self.options.rate
 
     def share(self, table: ParameterTable) -> float:
-        """Returns the share of the primitives that an event adds at the rate of growth."""
+        """Returns the share of the primitives that an event adds at this rate."""
         return (1 + self.rate(table)) ** (self.events.every / STEPS) - 1
 
     def ended(self, table: ParameterTable) -> bool:
@@ -253,15 +225,15 @@ class Adaptive(Capacity):
         return self.rate(table) < self.options.slowest
 
     def measures(self, table: ParameterTable) -> bool:
-        """Returns whether events are measured by what they gain."""
+        """Returns whether the gains of events are measured."""
         return self.options.judged and not self.ended(table)
 
     def room(self, table: ParameterTable, candidates: int, step: int) -> int:
-        """Returns a share of the primitives while growth pays, up to the cap."""
+        """Returns how many primitives an event may add, up to the cap."""
         return min(self.demand(table, step), room_under(self.most, len(table)))
 
     def demand(self, table: ParameterTable, step: int) -> int:
-        """Returns how many an event may add without a cap; none at the last one, which nothing would measure."""
+        """Returns how many primitives an event would add without a cap; none at the last, which no event measures."""
         if self.ended(table) or self.events.passed(step) == 1:
             return 0
         return max(1, round(self.share(table) * len(table))) if self.options.judged else sys.maxsize

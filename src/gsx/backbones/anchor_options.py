@@ -1,4 +1,4 @@
-"""Options of anchors, decoded by networks or explicit."""
+"""Options of neural and of explicit anchors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -66,25 +66,25 @@ class ExplicitRates:
 
 @dataclass(frozen=True, kw_only=True)
 class AnchorOptions(CapacityOptions):
-    """What all anchor backbones share; values in conf/backbone, with their sources."""
+    """Options of all anchor backbones; values in conf/backbone, with their sources."""
 
     name: str
     published_iterations: Interval
     fidelity: str
-    """reference: the published code with its quirks; sane: without them. Single ones: `quirks`."""
+    """reference: the published code with its quirks; sane: without them; `quirks` sets single ones."""
     filter: str
     volume_weight: Weight
-    """Of the mean volume of the Gaussians drawn, in the loss (Scaffold-GS, train.py)."""
+    """Weight of the mean volume of the drawn Gaussians in the loss (Scaffold-GS, train.py)."""
     voxel: Annotated[float, Range(0, 1e6)]
-    """Edge of the initial grid's cells without levels, world units; 0: from the points (Scaffold-GS)."""
+    """Without levels: edge of the initial grid's cells, world units; 0: from the points (Scaffold-GS)."""
     growth: GrowthOptions
     quirks: Quirks
     mip: MipOptions
     levels: LevelOptions | None
     decay_until: Steps = 0
-    """Published step at which learning rates have come down; 0: at the end of the run."""
+    """Published step at which learning rates reach their last value; 0: the end of the run."""
     reference: ClassVar[Mapping[str, str]] = MappingProxyType({})
-    """Quirks of the reference of this form that differ from those of `growth.CHOICES`."""
+    """Quirks of this form's reference that differ from those of `growth_options.CHOICES`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -93,11 +93,7 @@ class AnchorOptions(CapacityOptions):
         self.switches()
 
     def switches(self) -> Quirks:
-        """Returns all quirks, set one by one or by the fidelity.
-
-        Raises:
-            ValueError: a value is unknown.
-        """
+        """Returns all quirks, set one by one or by the fidelity; ValueError: a value is unknown."""
         return resolved(self.quirks, self.fidelity, self.reference)
 
 

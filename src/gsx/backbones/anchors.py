@@ -1,25 +1,23 @@
-"""Gaussians on anchors of a fixed grid (Scaffold-GS), at several levels of detail if asked for (Octree-GS).
+"""Gaussians on anchors of a fixed grid (Scaffold-GS), optionally at several levels of detail (Octree-GS).
 
-A backbone here is a representation (networks or explicit harmonics), with or without levels, with or without the Mip
-filters: each is a part that knows nothing of the others (docs/reference/backbones.md).
+A backbone combines a representation (networks or explicit harmonics), a grid with or without levels, and a filter;
+these parts do not depend on each other (docs/reference/backbones.md).
 """
 
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import Parameter
 
 from gsx.backbones.anchor_grids import grid_of
 from gsx.backbones.anchor_options import ExplicitOptions, HeadRates, NeuralOptions
 from gsx.backbones.capacity import event_steps, mark_newborn, without_newborn
 from gsx.backbones.capacity_options import capacity_of
 from gsx.backbones.cells import pooled_max
-from gsx.backbones.decoding import Decoded, Explicit, Neural, Representation, VisibleAnchors, lengths
+from gsx.backbones.decoding import DrawnAnchors, Explicit, Neural, Representation, VisibleAnchors, lengths
 from gsx.backbones.density import densification_statistics
 from gsx.backbones.growth import clamp_scales, eligible, fresh_statistics, observe, prune, reset_offsets
 from gsx.backbones.heads import Heads
@@ -29,13 +27,11 @@ from gsx.backbones.scene_model import SceneModel
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
-from gsx.core.gaussians.quaternions import make_identity_where_zero
-from gsx.core.gaussians.splats import Gaussians, Splats
-from gsx.core.quality.losses import volume_loss
+from gsx.core.gaussians.splats import Gaussians
 from gsx.core.rasterizer import Rendering, touches
-from gsx.core.shapes import Float, Int
+from gsx.core.shapes import Int
 from gsx.core.training.backbone import BackboneContext, Observation
-from gsx.core.training.parameter_table import Networks, ParameterTable, take_adam_step
+from gsx.core.training.parameter_table import Networks, ParameterTable
 from gsx.core.training.training_views import TrainingViews
 
 
@@ -47,32 +43,14 @@ def neural_anchors(options: NeuralOptions, context: BackboneContext) -> "Anchors
 
 
 def explicit_anchors(options: ExplicitOptions, context: BackboneContext) -> "Anchors":
-    """Builds the backbone octree_gs3d as reported: anchors of one Gaussian."""
+    """Builds the backbone octree_gs3d in its reported form: anchors of one Gaussian each."""
     logit = math.log(options.initial_opacity / (1 - options.initial_opacity))
     representation = Explicit(options.sh_degree, logit)
     return Anchors(options, context, representation, sh=(options.sh_degree, options.sh_every))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DrawnAnchors:
-    """Gaussians of a camera, and the anchors that they come from."""
-
-    decoded: Decoded
-    anchors: VisibleAnchors
-
-    @property
-    def splats(self) -> Splats:
-        """The Gaussians."""
-        return self.decoded.splats
-
-    @property
-    def rows(self) -> Int[Tensor, "M"]:
-        """The anchor of each."""
-        return self.decoded.slots // self.decoded.opacities.shape[1]
-
-
 def view_number(numbers: Mapping[Camera, int], views: TrainingViews, camera: Camera, step: int) -> int:
-    """Returns the number of the training view with this camera, in the scene or at the step; -1: none."""
+    """Returns the number of the training view whose camera this is, in the scene or at the step; -1: none."""
     if camera in numbers:
         return numbers[camera]
     numbered = (pair for training in (views.full_size, views.at(step)) for pair in enumerate(training))
@@ -80,7 +58,7 @@ def view_number(numbers: Mapping[Camera, int], views: TrainingViews, camera: Cam
 
 
 class Anchors(SceneModel):
-    """N anchors at fixed places, k Gaussians each."""
+    """N anchors at fixed positions with k Gaussians each."""
 
     absolute_gradient = False
 
@@ -96,7 +74,7 @@ class Anchors(SceneModel):
     ) -> None:
         points = context.points()
         self.options, self.representation, self.sh, self.sh_degree = options, representation, sh, sh[0]
-        self.network_rates, self.context = network_rates, context
+        self.network_rates, self.context, self.volume_weight = network_rates, context, options.volume_weight
         self.numbers = {view.camera: number for number, view in enumerate(context.scene.train)}
         self.schedule = context.schedule(options.published_iterations)
         self.events = event_steps(self.schedule, options.growth.start, options.growth.stop, options.growth.every)
@@ -104,34 +82,26 @@ class Anchors(SceneModel):
         self.raster = self.filter.rules(context.raster)
         self.capacity = capacity_of(options, context, self.events)
         self.grid = grid_of(options, context, self.schedule, points.positions.float())
-        self.table = self.initial_table(points, networks, context.device)
+        self.table = self.initial_table(points, networks)
         self.filter.refresh(self.table, self.table["anchors"])
 
-    def initial_table(self, points: PointCloud, networks: Networks | None, device: torch.device) -> ParameterTable:
-        """Places anchors on grid nodes next to the points (Scaffold-GS, voxelize_sample; Octree-GS, octree_sample)."""
+    def initial_table(self, points: PointCloud, networks: Networks | None) -> ParameterTable:
+        """Places anchors on the grid nodes nearest to the points (Scaffold-GS, create_from_pcd)."""
         positions, columns, owner, source = self.grid.start(points.positions.float())
         colours = pooled_max(points.colours[source].float() / 255, owner, len(positions))
         squares = mean_square_distance(positions).clamp_min(LEAST_SQUARE_DISTANCE)
         rows = self.representation.rows(0.5 * squares.log(), colours)
-        table = ParameterTable(
-            {name: Parameter(value.to(device)) for name, value in rows.items()},
-            {name: value.to(device) for name, value in (columns | {"anchors": positions}).items()},
-            fresh_statistics(len(positions), self.representation.offsets, device),
-            networks,
-            former_names={"sh_dc": "sh_constant"},
-        )
-        self.capacity.initialise(table)
-        return table
+        statistics = fresh_statistics(len(positions), self.representation.offsets, self.context.device)
+        return self.new_table(rows, columns | {"anchors": positions}, statistics, networks)
 
     # -- one step, in the order the trainer calls --------------------------------------------------------------
 
     def draw(self, camera: Camera, step: int) -> DrawnAnchors:
-        """Returns the Gaussians of the anchors that the camera sees at its distance."""
-        anchors = self.visible(camera, step)
-        return DrawnAnchors(decoded=self.representation.decode(self.table, anchors, self.filter), anchors=anchors)
+        """Decodes the anchors that the camera draws at its distance."""
+        return self.representation.decode(self.table, self.visible(camera, step), self.filter)
 
     def visible(self, camera: Camera, step: int) -> VisibleAnchors:
-        """Returns anchors of the levels that the camera draws, of which those in view (Octree-GS; Scaffold-GS)."""
+        """Returns the anchors in view on the levels that the camera draws (Scaffold-GS; Octree-GS)."""
         rows, weights = self.grid.visible(self.table, camera, step)
         reach = lengths(self.table["log_scales"].detach()[rows, :3])
         quats = self.representation.quats(self.table).detach()[rows]
@@ -147,26 +117,19 @@ class Anchors(SceneModel):
             backend=self.raster.backend.on(weights.device.type, learning=True),
         )
 
-    def regulariser(self, drawn: DrawnAnchors) -> Float[Tensor, ""] | None:
-        """Returns the mean volume of the Gaussians drawn; 0 for none (Scaffold-GS, train.py)."""
-        if not self.options.volume_weight:
-            return None
-        return volume_loss(drawn.splats.scales, self.options.volume_weight)
-
     def observe(self, drawn: DrawnAnchors, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
         """Returns visits, opacities and screen gradients while anchors grow (Scaffold-GS, training_statis)."""
         growth = self.options.growth
         if not self.schedule.step(growth.observe_from) < step < self.events.stop:
             return {}
-        decoded = drawn.decoded
-        on_screen = densification_statistics(rendering.screen, decoded.slots, weight)
+        on_screen = densification_statistics(rendering.screen, drawn.slots, weight)
         return {
-            "rows": drawn.anchors.rows,
-            "opacities": decoded.opacities,
+            "rows": drawn.anchors,
+            "opacities": drawn.opacities,
             "slots": on_screen["rows"],
-            "gradients": on_screen["gradient"].to(decoded.opacities),
-            "visits": on_screen["weight"].to(decoded.opacities),
-            "weight": decoded.opacities.new_full((1,), weight),
+            "gradients": on_screen["gradient"].to(drawn.opacities),
+            "visits": on_screen["weight"].to(drawn.opacities),
+            "weight": drawn.opacities.new_full((1,), weight),
         }
 
     def accumulate(self, observation: Observation) -> None:
@@ -184,11 +147,11 @@ class Anchors(SceneModel):
         return metrics
 
     def milestones(self) -> list[int]:
-        """Returns when growth ends."""
+        """Returns the step at which growth ends."""
         return [self.events.stop]
 
     def grow_and_prune(self, step: int) -> dict[str, float]:
-        """Grows, zeroes eligible offsets, prunes, clamps: the order of the reference (Scaffold-GS)."""
+        """Grows, resets eligible offsets, prunes and clamps in the order of the reference (Scaffold-GS)."""
         growth = self.options.growth
         visits = growth.success * self.schedule.interval(growth.every)
         metrics = self.capacity.evaluate(self, without_newborn, step)
@@ -214,42 +177,30 @@ class Anchors(SceneModel):
             for name in networks.names():
                 networks.set_rate(name, getattr(self.network_rates, name).at(step, steps))
 
-    def update(self, step: int) -> None:
-        """Takes one Adam step of anchors and networks. Unused SH bands take part with zero gradients, as in 3D-GS."""
-        moved = self.table.parameters.values()
-        if any(parameter.grad is not None for parameter in moved):
-            for parameter in moved:
-                parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
-        self.set_rates(step)
-        take_adam_step(self.table)
-        if "quats" in self.table.parameters:
-            make_identity_where_zero(self.table["quats"])
-
     # -- files and logs ----------------------------------------------------------------------------------------
 
     def explicit(self, camera: Camera | None, step: int) -> Gaussians:
-        """Returns the Gaussians drawn for a camera; without one those of all anchors, if these are explicit."""
+        """Returns the Gaussians that a camera draws; without a camera those of all anchors, if explicit."""
         if camera is None and self.table.networks is not None:
             raise InputError(
-                f"backbone {self.options.name} decodes its Gaussians for one camera at a time, so there are none that "
-                "hold for all: export those of a view, `gsx export RUN FILE.ply --view NAME`"
+                f"backbone {self.options.name} decodes its Gaussians for one camera at a time. Export those of a view: "
+                "`gsx export RUN FILE.ply --view NAME`"
             )
         with torch.no_grad():
-            decoded = self.everything() if camera is None else self.draw(camera, step).decoded
-        return self.representation.explicit(decoded, self.table)
+            drawn = self.everything() if camera is None else self.draw(camera, step)
+        return self.representation.explicit(drawn, self.table)
 
     def slot_count(self) -> int:
         """Returns the number of offsets of all anchors."""
         return len(self.table) * self.representation.offsets
 
     def slots(self, drawn: DrawnAnchors) -> tuple[Int[Tensor, "M"], Int[Tensor, "V"]]:
-        """Returns anchor row times k plus number of the offset; all offsets of the anchors in view."""
-        k = drawn.decoded.opacities.shape[1]
-        rows = drawn.anchors.rows
-        return drawn.decoded.slots, (rows[:, None] * k + torch.arange(k, device=rows.device)).flatten()
+        """Returns (slot of each Gaussian: anchor row times k plus offset; slots of all anchors in view)."""
+        k, rows = self.representation.offsets, drawn.anchors
+        return drawn.slots, (rows[:, None] * k + torch.arange(k, device=rows.device)).flatten()
 
-    def everything(self) -> Decoded:
-        """Decodes all anchors of all levels, as seen from anywhere."""
+    def everything(self) -> DrawnAnchors:
+        """Decodes all anchors of all levels; for explicit ones, whose Gaussians do not depend on the camera."""
         anchors = self.table["anchors"]
         every = VisibleAnchors(
             rows=torch.arange(len(anchors), device=anchors.device),
@@ -261,21 +212,18 @@ class Anchors(SceneModel):
         return self.representation.decode(self.table, every, self.filter)
 
     def file_columns(self) -> dict[str, Tensor]:
-        """Returns columns of the published files of each form (Octree-GS, save_ply): one row per anchor, raw values.
-
-        With a 3D filter its sizes follow, under the name that they have in files of Mip-Splatting.
-        """
+        """Returns the raw columns of the published file and the filter's sizes, a row per anchor (save_ply)."""
         table = self.table
         columns = dict(zip("xyz", table["anchors"].unbind(1), strict=True)) | self.grid.columns(table)
         columns |= self.representation.columns(table, self.grid.header(table))
         return columns | ({"filter_3D": table["filter"]} if "filter" in table.columns else {})
 
     def file_notes(self) -> list[str]:
-        """Returns where the 3D filter is, and what chooses the levels at a distance (Octree-GS, save_ply)."""
+        """Returns comments on the 3D filter and the levels."""
         filtered = f"{self.filter.note} of Gaussians; anchors have its size in filter_3D"
         return [filtered if self.filter.note else "no 3D filter", *self.grid.notes()]
 
     def plan(self) -> dict[str, Any]:
-        """Returns the schedule in steps of this run, and what was derived from the scene."""
+        """Returns the schedule in steps of this run, the capacity and the grid."""
         grow = {"from": self.events.start, "until": self.events.stop, "every": self.events.every}
         return {"grow": grow} | self.capacity.plan() | self.grid.plan(self.table)

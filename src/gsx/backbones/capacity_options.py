@@ -1,4 +1,4 @@
-"""Options of capacity: who decides how many primitives a model has."""
+"""Options of capacity, the rule for the number of primitives."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -13,14 +13,14 @@ CAPACITIES = ("published", "budget", "adaptive")
 
 @dataclass(frozen=True, kw_only=True)
 class CapacityOptions:
-    """Options of capacity, which every backbone of this package has."""
+    """Options of capacity, common to all backbones of this package."""
 
     max_primitives: Count
-    """No primitive is added beyond this number; 0: there is no cap."""
+    """Cap on the number of primitives; 0: none."""
     capacity: str = "published"
-    """published, budget or adaptive. The default: runs older than this option."""
+    """published, budget or adaptive; the default is for runs older than this option."""
     looks: Annotated[int, Range(1, 1000)] = 4
-    """Of a budget and adaptive: training views that the error of each primitive is measured in at an event."""
+    """With budget or adaptive: training views in which an event measures the error of each primitive."""
     budget: BudgetOptions = BudgetOptions()
     adaptive: AdaptiveOptions = AdaptiveOptions()
 
@@ -30,17 +30,17 @@ class CapacityOptions:
         if (self.capacity == "budget") != (self.budget.primitives > 0):
             raise ValueError(
                 f"backbone.capacity is {self.capacity} and backbone.budget.primitives {self.budget.primitives}: "
-                "a budget of so many primitives takes both, capacity=budget and a number above 0"
+                "a budget needs both, capacity=budget and a number above 0"
             )
         if 0 < self.max_primitives < self.budget.primitives:
             raise ValueError(
-                f"backbone.budget.primitives is {self.budget.primitives}, above backbone.max_primitives, which is "
-                f"{self.max_primitives}: raise that, or set it to 0"
+                f"backbone.budget.primitives is {self.budget.primitives}, above backbone.max_primitives "
+                f"{self.max_primitives}: raise the latter, or set it to 0"
             )
 
 
 def capacity_of(options: CapacityOptions, context: BackboneContext, events: EventSteps) -> Capacity:
-    """Builds the one that the options name."""
+    """Builds the capacity that the options name."""
     if options.capacity == "budget":
         return Budget(options.budget, context, events)
     if options.capacity == "adaptive":

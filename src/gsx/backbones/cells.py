@@ -1,4 +1,4 @@
-"""Cells of a grid as rows of integers: which are new, and what falls into each (Scaffold-GS, anchor_growing)."""
+"""Grid cells as rows of integers: new cells, and the largest values in each (Scaffold-GS, anchor_growing)."""
 
 import math
 
@@ -11,7 +11,7 @@ LARGEST_KEY = 2**63 - 1
 
 
 def pooled_max(values: Float[Tensor, "M ..."], group: Int[Tensor, "M"], count: int) -> Float[Tensor, "U ..."]:
-    """Returns the largest values of the rows of each of `count` groups; -inf for empty groups, without group -1."""
+    """Returns the largest values in each of `count` groups, -inf in empty ones; rows of group -1 are skipped."""
     known = group >= 0
     rows = values[known]
     index = group[known].long().reshape(-1, *[1] * (rows.dim() - 1)).expand_as(rows)
@@ -20,10 +20,7 @@ def pooled_max(values: Float[Tensor, "M ..."], group: Int[Tensor, "M"], count: i
 
 
 def new_cells(candidates: Int[Tensor, "M 3"], taken: Int[Tensor, "T 3"]) -> tuple[Int[Tensor, "U 3"], Int[Tensor, "M"]]:
-    """Returns (cells, group): candidate cells that are not taken, once, in lexicographic order; each candidate's row.
-
-    The row is among those cells; -1 where the candidate's cell is taken.
-    """
+    """Returns (distinct candidate cells that are not taken, lexicographic; row of each candidate's cell, -1: taken)."""
     if len(candidates) == 0:
         return candidates, candidates.new_empty(0)
     keys = cell_keys(torch.cat([candidates, taken]))
@@ -31,12 +28,12 @@ def new_cells(candidates: Int[Tensor, "M 3"], taken: Int[Tensor, "T 3"]) -> tupl
     fresh = ~torch.isin(found, keys[len(candidates) :])
     number = torch.where(fresh, fresh.cumsum(0) - 1, -1)
     cells = candidates.new_empty(len(found), 3)
-    cells[place] = candidates  # equal rows meet in one place
+    cells[place] = candidates  # equal candidates share one place
     return cells[fresh], number[place]
 
 
 def cell_keys(cells: Int[Tensor, "M 3"]) -> Int[Tensor, "M"]:
-    """Returns one integer per cell, equal for equal cells and in their lexicographic order."""
+    """Returns one integer per cell, in the lexicographic order of the cells."""
     low, high = cells.amin(0).tolist(), cells.amax(0).tolist()
     _, height, depth = lengths = [last - first + 1 for first, last in zip(low, high, strict=True)]
     if math.prod(lengths) > LARGEST_KEY:
@@ -46,7 +43,7 @@ def cell_keys(cells: Int[Tensor, "M 3"]) -> Int[Tensor, "M"]:
 
 
 def ranked_keys(cells: Int[Tensor, "M 3"]) -> Int[Tensor, "M"]:
-    """Returns the same for cells however far apart, by ranks of coordinates: no product exceeds M^2."""
+    """Returns `cell_keys` from ranks of coordinates, at most M^2: for cells too far apart for one product."""
     keys = torch.zeros_like(cells[:, 0])
     for coordinate in cells.unbind(1):
         found, rank = coordinate.unique(return_inverse=True)

@@ -1,7 +1,7 @@
 """Clone and split across levels of detail: Octree-GS on free Gaussians (GSOctree).
 
-Small Gaussians with large gradients get a copy on their own level. Large ones get one smaller child on the next level
-and stay as they are. Without pointers between levels, a Gaussian's level is all that ties it to the octree.
+Small Gaussians with large gradients get a copy on their own level; large ones stay and get one smaller child on the
+next level. A Gaussian's level is its only link to the octree.
 """
 
 import logging
@@ -23,11 +23,10 @@ from gsx.backbones.sampling import sampled_means
 from gsx.backbones.visibility import Visibility, VisibleGaussians
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
-from gsx.core.quality.losses import volume_loss
 from gsx.core.ranges import Range, Share, Weight
 from gsx.core.rasterizer import take_rows
 from gsx.core.shapes import Bool, Float, Int
-from gsx.core.training.backbone import Backbone, BackboneContext, DrawnSplats
+from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows
 
 logger = logging.getLogger(__name__)
@@ -35,18 +34,18 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class LevelDensityOptions:
-    """Numbers of density control across levels; values in conf/backbone, with their sources."""
+    """Options of density control across levels; values in conf/backbone, with their sources."""
 
     update_ratio: Annotated[float, Range(0, 100)]
     """The gradient threshold grows by fork ** this per level."""
     bias_gradient: Annotated[float, Range(0, 100)]
-    """Gaussians with this multiple of the threshold are drawn from a little farther."""
+    """Multiple of the threshold above which a Gaussian is drawn from farther away."""
     bias_step: Annotated[float, Range(0, 100)]
-    """By how much, in levels."""
+    """Increase of its level bias, in levels."""
     shrink: Share
-    """A child's scale is its parent's times this."""
+    """Scale of a child over its parent's."""
     volume_weight: Weight
-    """Of the mean volume of the Gaussians drawn, in the loss."""
+    """Weight of the mean volume of the drawn Gaussians in the loss."""
 
     def __post_init__(self) -> None:
         if not self.shrink > 0:
@@ -54,7 +53,7 @@ class LevelDensityOptions:
 
 
 class DensifyMasks(NamedTuple):
-    """What happens to each of N Gaussians."""
+    """Decisions for N Gaussians."""
 
     cloned: Bool[Tensor, "N"]
     split: Bool[Tensor, "N"]
@@ -62,7 +61,7 @@ class DensifyMasks(NamedTuple):
 
 
 def starting_points(points: PointCloud, levels: Levels) -> tuple[PointCloud, dict[str, Tensor]]:
-    """Returns (points, columns) to start from: nodes of the levels, half a cell beyond, in their largest colours.
+    """Returns initial (points, columns): nodes of the levels, half a cell beyond, with the largest colours in each.
 
     Source: Octree-GS, octree_sample and weed_out; GSOctree.
     """
@@ -74,8 +73,8 @@ def starting_points(points: PointCloud, levels: Levels) -> tuple[PointCloud, dic
 
 
 def relative_sizes(scales: Float[Tensor, "N 3"], of: Int[Tensor, "N"], count: int) -> Float[Tensor, "K"]:
-    """Returns the mean scale of each level over that of level 0 (GSOctree); 1 where one of them is empty."""
-    sizes = scales.double().mean(1)  # a mean for each level by itself: sums by index have no fixed order on a GPU
+    """Returns the mean scale of each level over that of level 0 (GSOctree); 1 if either is empty."""
+    sizes = scales.double().mean(1)  # a mean per level: sums by index have no fixed order on a GPU
     means = torch.stack([sizes[of == level].sum() / (of == level).sum().clamp_min(1) for level in range(count)])
     known = (means > 0) & (means[0] > 0)
     return torch.where(known, means / means[0].clamp_min(torch.finfo(means.dtype).tiny), 1.0).to(scales)
@@ -92,10 +91,10 @@ def densify_masks(
     large: float,
     splitting: bool,
 ) -> DensifyMasks:
-    """Marks what is cloned, split and drawn from farther, by the threshold and the size of its level (GSOctree).
+    """Marks Gaussians to clone, to split and to draw from farther, by their level's threshold and size (GSOctree).
 
-    `threshold` and `large` (a scale, world units) are those of level 0; without `splitting` nothing happens to large
-    ones. Ours: never a Gaussian without any gradient.
+    `threshold` and `large` (a scale, world units) are those of level 0; without `splitting` large ones are skipped.
+    Ours: Gaussians without gradient are never chosen.
     """
     taus = torch.tensor(thresholds(threshold, levels.fork, options.update_ratio, levels.count)).to(gradient)
     tau = taus[of.long()]
@@ -106,14 +105,14 @@ def densify_masks(
 
 
 def clones(raw: dict[str, Tensor], rows: Int[Tensor, "M"]) -> dict[str, Tensor]:
-    """Copies rows on the same level, without bias."""
+    """Copies rows on the same level, with bias 0."""
     return {name: value[rows] for name, value in raw.items()} | {"bias": torch.zeros_like(raw["bias"][rows])}
 
 
 def small_children(
     raw: dict[str, Tensor], rows: Int[Tensor, "M"], levels: Levels, shrink: float, generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """Draws one child from each parent's Gaussian, smaller and a level finer, without bias."""
+    """Draws one child from each parent's Gaussian, smaller and a level finer, with bias 0."""
     parents = {name: value[rows] for name, value in raw.items()}
     changed = {
         "means": sampled_means(parents, generator),
@@ -124,14 +123,8 @@ def small_children(
     return parents | changed
 
 
-def bias_levels(table: ParameterTable, biased: Bool[Tensor, "N"], step: float, most: float) -> None:
-    """Lets Gaussians with fair gradients be drawn from a little farther, by at most `most` levels."""
-    table["bias"][: len(biased)] += step * biased
-    table["bias"].clamp_max_(most)
-
-
 class VisibleByLevel(Visibility):
-    """A camera draws the Gaussians of the levels that its distance asks for (Octree-GS)."""
+    """Visibility by level: a camera draws the levels that its distance needs (Octree-GS)."""
 
     by_level = True
 
@@ -139,14 +132,14 @@ class VisibleByLevel(Visibility):
         self.levels = levels
 
     def start(self, points: PointCloud) -> tuple[PointCloud, dict[str, Tensor]]:
-        """Returns the nodes of the levels; columns `level` and `bias`."""
+        """Returns the nodes of the levels and the columns `level` and `bias`."""
         cloud, columns = starting_points(points, self.levels)
         for warning in warnings_of(self.levels, len(cloud)):
             logger.warning("%s", warning)
         return cloud, columns
 
     def visible(self, table: ParameterTable, camera: Camera, step: int) -> VisibleGaussians:
-        """Returns Gaussians of the levels that the camera draws, faded by the mode (Octree-GS, set_anchor_mask)."""
+        """Returns the Gaussians of the levels that the camera draws, faded by the mode (Octree-GS, set_anchor_mask)."""
         means, level, bias = (table[name] for name in ("means", "level", "bias"))
         mask, weights = drawn(self.levels, means.detach(), level, bias, camera, self.levels.highest(step))
         rows = mask.nonzero()[:, 0]
@@ -155,22 +148,22 @@ class VisibleByLevel(Visibility):
         return VisibleGaussians(values=values, rows=rows, weights=weights[rows])
 
     def columns(self, table: ParameterTable) -> dict[str, Tensor]:
-        """Returns levels, and the distance at which the coarsest alone is drawn (GSOctree, save_ply)."""
+        """Returns levels, bias, and the distance beyond which only level 0 is drawn (GSOctree, save_ply)."""
         info = torch.zeros_like(table["bias"])
         info[:1] = self.levels.farthest
         return {"level": table["level"].float(), "extra_level": table["bias"], "info": info}
 
     def plan(self, table: ParameterTable) -> dict[str, Any]:
-        """Returns the levels in numbers."""
+        """Returns the figures of the levels."""
         return {"levels": facts_of(self.levels, table["level"])}
 
     def notes(self) -> list[str]:
-        """Returns what chooses the levels at a distance."""
+        """Returns how a viewer chooses the levels at a distance."""
         return [note_of(self.levels)]
 
 
 class CloneSplitAcrossLevels(DensityControl):
-    """Copies small Gaussians on their level, and gives large ones a child a level finer (GSOctree)."""
+    """Density control that copies small Gaussians and adds children of large ones a level finer (GSOctree)."""
 
     def __init__(
         self,
@@ -182,9 +175,10 @@ class CloneSplitAcrossLevels(DensityControl):
     ) -> None:
         super().__init__(options, context)
         self.levels, self.level_density, self.quirks = levels, level_density, quirks
+        self.volume_weight = level_density.volume_weight
 
     def add(self, model: Backbone[Any], step: int) -> dict[str, float]:
-        """Adds copies and children that enough cameras would draw; parents stay."""
+        """Adds the copies and children that enough cameras draw; parents stay."""
         table, levels, options = model.table, self.levels, self.level_density
         gradient = mean_gradient(table)
         masks = densify_masks(
@@ -204,7 +198,8 @@ class CloneSplitAcrossLevels(DensityControl):
         visible = kept(levels, new["means"], new["level"])
         room = self.capacity.room(table, int(visible.sum()), step)
         keep = within_room(visible, gradient[torch.cat([cloned, split])], room)
-        bias_levels(table, masks.biased, options.bias_step, 1.0 if self.quirks.bias == "own" else math.inf)
+        table["bias"].add_(options.bias_step * masks.biased)
+        table["bias"].clamp_max_(1.0 if self.quirks.bias == "own" else math.inf)
         old = len(table)
         append_rows(table, {name: value[keep] for name, value in new.items()})
         mark_newborn(table, old)
@@ -214,9 +209,3 @@ class CloneSplitAcrossLevels(DensityControl):
     def before_last_event(self, table: ParameterTable) -> ParameterTable | None:
         """Returns the table without the copies and children of the last event."""
         return without_newborn(table)
-
-    def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
-        """Returns the mean volume of what was drawn, 0 for nothing."""
-        if not self.level_density.volume_weight:
-            return None
-        return volume_loss(drawn.splats.scales, self.level_density.volume_weight)

@@ -1,4 +1,4 @@
-"""Two ways in which an anchor stands for Gaussians: networks (Scaffold-GS) and explicit harmonics (Octree-AnyGS)."""
+"""Two representations of an anchor's Gaussians: networks (Scaffold-GS) and explicit harmonics (Octree-AnyGS)."""
 
 import math
 from dataclasses import dataclass
@@ -19,41 +19,48 @@ from gsx.core.training.parameter_table import ParameterTable
 from gsx.formats.smoothing import logit_of_log
 
 LARGEST_LOG_SCALE = 30.0
-"""Lengths are held below e^30 world units, so that their squares stay finite in float32."""
+"""Bound of log-lengths: squares of e^30 world units stay finite in float32."""
 LEAST = 1e-37
-"""A length (world units) or weight of 0 counts as this: its logarithm is finite."""
+"""Lower bound of lengths (world units) and weights whose logarithm is taken."""
 INERT_LOGIT = math.log(0.1 / 0.9)
-"""Opacity of an anchor in published files; nothing uses it (Scaffold-GS, create_from_pcd)."""
+"""Unused opacity of an anchor in published files (Scaffold-GS, create_from_pcd)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VisibleAnchors:
-    """Anchors that take part in a picture."""
+    """Anchors that a camera draws."""
 
     rows: Int[Tensor, "A"]
     weights: Float[Tensor, "A"]
-    """Factor of their opacities: below 1 where a level fades in."""
+    """Factors of their opacities: below 1 while a level fades in."""
     camera: Camera
     view: int
     """Number of the training view, -1 for any other camera."""
     sh_degree: int
     backend: Backend = EAGER
-    """What computes their colours."""
+    """Backend of the colour computation."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Decoded:
-    """The Gaussians of one picture and where they come from."""
+class DrawnAnchors:
+    """Gaussians of a camera and their anchors."""
 
     splats: Splats
+    anchors: Int[Tensor, "A"]
+    """Rows of the anchors in view."""
     slots: Int[Tensor, "M"]
     """Anchor row times k plus the number of the offset."""
     opacities: Float[Tensor, "A k"]
-    """Opacity of every offset of the anchors drawn, without gradient; what is not drawn counts as 0."""
+    """Opacities of all offsets of these anchors, without gradient; 0 for those not drawn."""
+
+    @property
+    def rows(self) -> Int[Tensor, "M"]:
+        """Return the anchor row of each Gaussian."""
+        return self.slots // self.opacities.shape[1]
 
 
 def lengths(log_scales: Float[Tensor, "A V"]) -> Float[Tensor, "A V"]:
-    """Returns exp, finite when squared."""
+    """Returns lengths whose squares are finite."""
     return log_scales.clamp(max=LARGEST_LOG_SCALE).exp()
 
 
@@ -63,12 +70,12 @@ def identity_quats(values: Float[Tensor, "N *rest"]) -> Float[Tensor, "N 4"]:
 
 
 def numbered(prefix: str, values: Float[Tensor, "N V"]) -> dict[str, Float[Tensor, "N"]]:
-    """Returns columns of a file, by number."""
+    """Returns numbered columns of a file."""
     return {f"{prefix}{i}": column.detach() for i, column in enumerate(values.unbind(1))}
 
 
 def baked(splats: Splats, constant: Float[Tensor, "M 3"], rest: Float[Tensor, "M B 3"]) -> Gaussians:
-    """Returns Gaussians of a standard file that draw these splats."""
+    """Returns Gaussians of a standard file that render as these splats."""
     return Gaussians(
         means=splats.means.detach(),
         log_scales=splats.scales.detach().clamp_min(LEAST).log(),
@@ -80,16 +87,16 @@ def baked(splats: Splats, constant: Float[Tensor, "M 3"], rest: Float[Tensor, "M
 
 
 class Neural:
-    """Features decoded by networks into k Gaussians, of which those with positive opacity are drawn (Scaffold-GS)."""
+    """Features that networks decode into k Gaussians; those with positive opacity are drawn (Scaffold-GS)."""
 
     pooled: tuple[str, ...] = ("features",)
-    """Parameters that a new anchor takes from its parents, as their largest values."""
+    """Parameters that a new anchor inherits: the largest values of its parents."""
 
     def __init__(self, heads: Heads) -> None:
         self.heads, self.offsets = heads, heads.offsets
 
     def rows(self, log_lengths: Float[Tensor, "N"], colours: Float[Tensor, "N 3"]) -> dict[str, Tensor]:
-        """Returns parameters of new anchors, all six log-lengths alike: zero features and offsets."""
+        """Returns parameters of new anchors: equal log-lengths, features and offsets 0."""
         count = len(log_lengths)
         return {
             "offsets": log_lengths.new_zeros(count, self.offsets, 3),
@@ -97,8 +104,8 @@ class Neural:
             "log_scales": log_lengths[:, None].repeat(1, 6),
         }
 
-    def decode(self, table: ParameterTable, visible: VisibleAnchors, filter_: Filter) -> Decoded:
-        """Decodes the anchors drawn: mu = x + O l[0:3], s = l[3:6] sigmoid, opacity tanh > 0 (Scaffold-GS)."""
+    def decode(self, table: ParameterTable, visible: VisibleAnchors, filter_: Filter) -> DrawnAnchors:
+        """Decodes anchors: mu = x + O l[0:3], s = l[3:6] sigmoid, opacity tanh > 0 (Scaffold-GS)."""
         rows, k = visible.rows, self.offsets
         anchors = table["anchors"][rows]
         raw, shapes, colours = self.heads(
@@ -108,7 +115,7 @@ class Neural:
             visible.view,
         )
         opacities = raw * visible.weights[:, None]
-        # what is not a number is handed on: the render counts it
+        # NaN stays: the render counts it
         chosen = (~(opacities.detach() <= 0)).view(-1).nonzero()[:, 0]
         owner = chosen // k
         size = repeat_rows(lengths(take_rows(table["log_scales"], rows)), owner)
@@ -122,22 +129,20 @@ class Neural:
             log_opacities=log_opacities,
             colours=take_rows(colours.reshape(-1, 3), chosen),
         )
-        return Decoded(splats=splats, slots=rows[owner] * k + chosen % k, opacities=opacities.detach().clamp_min(0))
+        slots = rows[owner] * k + chosen % k
+        return DrawnAnchors(splats=splats, anchors=rows, slots=slots, opacities=opacities.detach().clamp_min(0))
 
     def quats(self, table: ParameterTable) -> Float[Tensor, "N 4"]:
-        """Returns identities: an anchor's rotation never learns in the reference (Scaffold-GS)."""
+        """Returns identities: the reference never optimises an anchor's rotation (Scaffold-GS)."""
         return identity_quats(table["anchors"])
 
-    def explicit(self, decoded: Decoded, table: ParameterTable) -> Gaussians:
-        """Returns Gaussians of a splat file with colours as the camera saw them, in the constant band."""
-        colours = constant_from_colour(decoded.splats.colours)
-        return baked(decoded.splats, colours, colours.new_zeros(len(colours), 0, 3))
+    def explicit(self, drawn: DrawnAnchors, table: ParameterTable) -> Gaussians:
+        """Returns Gaussians of a splat file with this camera's colours in the constant band."""
+        colours = constant_from_colour(drawn.splats.colours)
+        return baked(drawn.splats, colours, colours.new_zeros(len(colours), 0, 3))
 
     def columns(self, table: ParameterTable, header: dict[str, Float[Tensor, "N"]]) -> dict[str, Float[Tensor, "N"]]:
-        """Returns file columns after positions, the grid's `header` first; what never learns has its initial value.
-
-        Source: Scaffold-GS, create_from_pcd.
-        """
+        """Returns the file columns after the positions; unused ones keep initial values (Scaffold-GS, save_ply)."""
         inert = torch.full_like(table["anchors"][:, 0], INERT_LOGIT)
         return (
             header
@@ -150,7 +155,7 @@ class Neural:
 
 
 class Explicit:
-    """One Gaussian per anchor with spherical harmonics of its own, all of them drawn (Octree-AnyGS)."""
+    """One Gaussian with spherical harmonics per anchor, always drawn (Octree-AnyGS)."""
 
     offsets = 1
     pooled: tuple[str, ...] = ("sh_dc", "sh_rest")
@@ -159,7 +164,7 @@ class Explicit:
         self.sh_degree, self.initial_logit = sh_degree, initial_logit
 
     def rows(self, log_lengths: Float[Tensor, "N"], colours: Float[Tensor, "N 3"]) -> dict[str, Tensor]:
-        """Returns parameters of new anchors: colours in [0, 1] in the constant band, no offset."""
+        """Returns parameters of new anchors: colours in [0, 1] in the constant band, offset 0."""
         count = len(log_lengths)
         return {
             "offsets": log_lengths.new_zeros(count, 1, 3),
@@ -170,8 +175,8 @@ class Explicit:
             "sh_rest": log_lengths.new_zeros(count, (self.sh_degree + 1) ** 2 - 1, 3),
         }
 
-    def decode(self, table: ParameterTable, visible: VisibleAnchors, filter_: Filter) -> Decoded:
-        """Decodes the anchors drawn: mu = x + O l[0:3], s = l[3:6], opacity sigmoid times the level's weight."""
+    def decode(self, table: ParameterTable, visible: VisibleAnchors, filter_: Filter) -> DrawnAnchors:
+        """Decodes anchors: mu = x + O l[0:3], s = l[3:6], opacity sigmoid times the level's weight."""
         rows = visible.rows
         row = {name: take_rows(table[name], rows) for name in table.parameters}
         size = lengths(row["log_scales"])
@@ -188,19 +193,19 @@ class Explicit:
             log_opacities=log_opacities,
             colours=colours_of(row["sh_dc"], row["sh_rest"], offsets, visible.sh_degree, visible.backend),
         )
-        return Decoded(splats=splats, slots=rows, opacities=opacities)
+        return DrawnAnchors(splats=splats, anchors=rows, slots=rows, opacities=opacities)
 
     def quats(self, table: ParameterTable) -> Float[Tensor, "N 4"]:
         """Returns the rotations of the Gaussians."""
         return table["quats"]
 
-    def explicit(self, decoded: Decoded, table: ParameterTable) -> Gaussians:
+    def explicit(self, drawn: DrawnAnchors, table: ParameterTable) -> Gaussians:
         """Returns Gaussians of a splat file with all bands."""
-        rows = decoded.slots
-        return baked(decoded.splats, table["sh_dc"].detach()[rows, 0], table["sh_rest"].detach()[rows])
+        rows = drawn.slots
+        return baked(drawn.splats, table["sh_dc"].detach()[rows, 0], table["sh_rest"].detach()[rows])
 
     def columns(self, table: ParameterTable, header: dict[str, Float[Tensor, "N"]]) -> dict[str, Float[Tensor, "N"]]:
-        """Returns file columns after positions and levels; f_rest is channel-major."""
+        """Returns the file columns after positions and levels; f_rest is channel-major."""
         return (
             numbered("f_offset_", table["offsets"].flatten(1))
             | numbered("f_dc_", table["sh_dc"][:, 0])
@@ -212,4 +217,4 @@ class Explicit:
 
 
 Representation = Neural | Explicit
-"""What an anchor holds, and how it is decoded."""
+"""Parameters of an anchor and their decoding."""

@@ -1,10 +1,8 @@
-"""Adaptive density control's arithmetic: statistics of renders for each primitive, and a cap on additions.
+"""Arithmetic of adaptive density control: render statistics of each primitive, and a cap on additions.
 
-Statistics are per-primitive sums over the renders since the last density event, each counted by its weight in a step's
-loss. The photograph of a step of one view weighs 1; of n views each weighs 1 / n; a pseudo view weighs what its mean
-difference does in the loss, and photographs what is left to them. Gradients are those of the step's loss, so they
-carry that weight too: sums of both have a mean as large as that of single photographs, which published thresholds are
-made for, whatever the batch and the augmenters.
+Statistics are sums over the renders since the last density event, weighted as in the step's loss: each of n photos of a
+step has weight 1 / n, less the share of its pseudo views. Gradients of the loss carry the same weight, so means stay
+comparable with published thresholds for any batch and augmenter.
 """
 
 import sys
@@ -21,12 +19,12 @@ GATHERED = frozenset({"gradient", "count", "absolute"})
 
 
 def room_under(cap: int, count: int) -> int:
-    """Returns how many rows may be added to `count` of them under a cap; a cap of 0 is none."""
+    """Returns how many rows may join `count` rows under a cap; 0: no cap."""
     return max(0, cap - count) if cap else sys.maxsize
 
 
 def within_room(chosen: Bool[Tensor, "N"], gradient: Float[Tensor, "N"], room: int) -> Bool[Tensor, "N"]:
-    """Keeps of the chosen rows those with the largest gradients, at most `room`."""
+    """Keeps at most `room` of the chosen rows, those with the largest gradients."""
     if int(chosen.sum()) <= room:
         return chosen
     ranked = torch.where(chosen, gradient, -1.0).argsort(descending=True, stable=True)[:room]
@@ -34,7 +32,7 @@ def within_room(chosen: Bool[Tensor, "N"], gradient: Float[Tensor, "N"], room: i
 
 
 def over_cap(eligible: Bool[Tensor, "N"], chosen: Bool[Tensor, "N"]) -> dict[str, float]:
-    """Returns how many eligible rows are over the cap, for the metrics of a step; empty: none."""
+    """Returns the metric of eligible rows over the cap; empty: none."""
     count = int(eligible.sum()) - int(chosen.sum())
     return {"withheld": count} if count else {}
 
@@ -42,10 +40,9 @@ def over_cap(eligible: Bool[Tensor, "N"], chosen: Bool[Tensor, "N"]) -> dict[str
 def densification_statistics(
     screen: ScreenStatistics, drawn: Int[Tensor, "N"] | None = None, weight: float = 1.0
 ) -> dict[str, Tensor]:
-    """Returns norms of the screen gradients of one render, and how much each primitive was seen (3D-GS).
+    """Returns screen gradient norms of one render, and its `weight` in the loss for visible primitives (3D-GS).
 
-    That is `weight`, the render's weight in the loss, or 0 where a primitive was not visible. `drawn`: rows of the
-    splats that were rendered; None: splat n is row n.
+    `drawn`: rows of the rendered splats; None: splat n is row n.
     """
     visible = screen.visible
     observation = {
@@ -59,23 +56,22 @@ def densification_statistics(
 
 
 def mean_of(sums: Float[Tensor, "*N"], counts: Float[Tensor, "*N"]) -> Float[Tensor, "*N"]:
-    """Divides sums by sums of weights; where nothing was counted it returns the sum itself, which is 0."""
+    """Divides sums by sums of weights; 0 without any weight."""
     return sums / torch.where(counts > 0, counts, 1.0)
 
 
 def gradient_statistics(count: int, device: torch.device | str, absolute: bool = False) -> dict[str, Tensor]:
-    """Returns empty statistics of `count` primitives, for a table.
+    """Returns statistics of `count` primitives, all 0.
 
-    `gradient`: sum of the norm of the screen gradient in NDC units. `count`: sum of the weights of the renders in which
-    the primitive was visible: steps, where all see it. `absolute`, where it is gathered: sum of |g_x| + |g_y| over
-    pixels, NDC units (Mip-Splatting, densify_and_prune).
+    `gradient`: sum of screen gradient norms, NDC units. `count`: sum of the weights of the renders that show the
+    primitive. `absolute`: sum of |g_x| + |g_y| over pixels, NDC units (Mip-Splatting, densify_and_prune).
     """
     names = ("gradient", "count", "absolute") if absolute else ("gradient", "count")
     return {name: torch.zeros(count, device=device) for name in names}
 
 
 def add_statistics(table: ParameterTable, observation: dict[str, Tensor]) -> None:
-    """Adds what `densification_statistics` returned for one render."""
+    """Adds the `densification_statistics` of one render."""
     sums, rows = table.statistics, observation["rows"]
     sums["gradient"].index_add_(0, rows, observation["gradient"].to(sums["gradient"]))
     sums["count"].index_add_(0, rows, observation["weight"].to(sums["count"]))
@@ -90,10 +86,10 @@ def zero_statistics(table: ParameterTable) -> None:
 
 
 def mean_gradient(table: ParameterTable) -> Float[Tensor, "N"]:
-    """Returns the weighted mean norm over the renders that saw the primitive; 0 for unseen ones."""
+    """Returns the weighted mean gradient norm over the renders that show the primitive; 0 without one."""
     return mean_of(table.statistics["gradient"], table.statistics["count"])
 
 
 def mean_absolute(table: ParameterTable) -> Float[Tensor, "N"]:
-    """Returns the same of the absolute gradients."""
+    """Returns the weighted mean absolute gradient."""
     return mean_of(table.statistics["absolute"], table.statistics["count"])

@@ -1,4 +1,4 @@
-"""Adaptive density control of free Gaussians: when it acts, what all its ways share, and clone and split (3D-GS)."""
+"""Adaptive density control of free Gaussians: events, pruning, opacity resets, and clone and split (3D-GS)."""
 
 import math
 from typing import Any
@@ -16,16 +16,18 @@ from gsx.backbones.sampling import quantile, sampled_means
 from gsx.backbones.sky import not_sky
 from gsx.backbones.visibility import everything, extents
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.backbone import Backbone, BackboneContext, DrawnSplats
+from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.parameter_table import ParameterTable, append_rows, detached_rows, keep_rows, reset_column
 from gsx.formats.smoothing import logit_of_log
 
 
 class DensityControl:
-    """Adds, prunes and resets the opacities of Gaussians (Kerbl et al. 2023, section 5); subclasses say how to add."""
+    """Density control (Kerbl et al. 2023, section 5); subclasses define how Gaussians are added."""
 
     resets = False
-    """Whether opacities are reset while it runs."""
+    """True: opacities are reset at intervals."""
+    volume_weight = 0.0
+    """Weight of the mean volume of the drawn Gaussians in the loss."""
 
     def __init__(self, options: GS3DOptions, context: BackboneContext) -> None:
         self.options, self.context = options.density, context
@@ -36,31 +38,27 @@ class DensityControl:
         self.reset_every = self.schedule.interval(self.options.reset_every, self.options.reset_passes)
         white = bool((context.scene.background == 1).all())
         self.white_reset = max(1, self.schedule.step(self.options.white_reset)) if white else 0
-        """Step of an extra reset on a white background (3D-GS, train.py); 0: there is none."""
+        """Step of the extra reset on a white background (3D-GS, train.py); 0: none."""
 
     # -- how Gaussians are added ---------------------------------------------------------------------------------
 
     def add(self, model: Backbone[Any], step: int) -> dict[str, float]:
-        """Adds Gaussians; returns how many in which way, and how many are over the cap."""
+        """Adds Gaussians; returns metrics."""
         raise NotImplementedError
 
     def before_last_event(self, table: ParameterTable) -> ParameterTable | None:
-        """Returns the table as it would be had the last event added nothing, for adaptive capacity; None: it did."""
-        return None
-
-    def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
-        """Returns a term of the loss of a view, or None."""
+        """Returns the table without the additions of the last event, for adaptive capacity; None: there were none."""
         return None
 
     # -- events --------------------------------------------------------------------------------------------------
 
     def reset_due(self, step: int) -> bool:
-        """Returns whether opacities are reset at a step: while density control runs, every reset interval."""
+        """Returns whether opacities are reset at a step."""
         due = step % self.reset_every == 0 or step == self.white_reset
         return self.resets and step < self.events.stop and due
 
     def densify(self, model: Backbone[Any], step: int) -> dict[str, float]:
-        """Evaluates, adds, prunes, and zeroes statistics (3D-GS, densify_and_prune: the order in one event)."""
+        """Evaluates, adds, prunes and zeroes statistics: one event (3D-GS, densify_and_prune)."""
         metrics = self.capacity.evaluate(model, self.before_last_event, step)
         metrics |= self.add(model, step)
         metrics["pruned"] = self.prune(model.table, step)
@@ -68,20 +66,17 @@ class DensityControl:
         return metrics
 
     def prune(self, table: ParameterTable, step: int) -> int:
-        """Removes faint primitives, and after the first reset huge ones; returns how many."""
+        """Removes faint primitives, and huge ones after the first reset interval; returns how many."""
         pruned = table["opacity_logits"].sigmoid() < self.options.prune_opacity
         if step > self.reset_every:
             pruned |= (largest_scales(table) > self.options.prune_extent * self.extent) & not_sky(table)
-        if bool(pruned.all()):  # a cloud about to vanish keeps what it has (gaussian-splatting issue 482)
+        if bool(pruned.all()):  # gaussian-splatting issue 482
             return 0
         keep_rows(table, ~pruned)
         return int(pruned.sum())
 
     def reset_opacities(self, table: ParameterTable, filter_: Filter) -> None:
-        """Sets o <- min(o, reset_opacity), moments zeroed (3D-GS); the sky stays as opaque as it is.
-
-        With a 3D filter o is what is drawn (Mip-Splatting).
-        """
+        """Sets o <- min(o, reset_opacity) except for the sky (3D-GS); o includes the 3D filter (Mip-Splatting)."""
         logits, drawn = table["opacity_logits"].detach(), extents(table, everything(table), filter_)[1].detach()
         excess = (drawn - math.log(self.options.reset_opacity)).clamp_min(0) * not_sky(table)
         lowered = torch.where(excess > 0, logit_of_log(logsigmoid(logits) - excess), logits)
@@ -101,27 +96,30 @@ class DensityControl:
 
 
 class CloneSplit(DensityControl):
-    """3D-GS: clones small and splits large Gaussians with large gradients (Kerbl et al. 2023, section 5.2)."""
+    """Density control of 3D-GS: clones small and splits large Gaussians (Kerbl et al. 2023, section 5.2)."""
 
     resets = True
 
     def add(self, model: Backbone[Any], step: int) -> dict[str, float]:
-        """Replaces split parents by two children each, and clones (3D-GS, densify_and_clone, densify_and_split)."""
+        """Clones, and replaces split parents by two children (3D-GS, densify_and_clone, densify_and_split)."""
         table, options = model.table, self.options
         gradient = mean_gradient(table)
         eligible = candidates(table, gradient, options) & not_sky(table)
         chosen = within_room(eligible, gradient, self.capacity.room(table, int(eligible.sum()), step))
         large = largest_scales(table) > options.split_extent * self.extent
         cloned, split = chosen & ~large, chosen & large
-        clone_and_split(table, cloned, split, options.split_shrink, self.generator)
+        raw = detached_rows(table)
+        parents = {name: value[split] for name, value in raw.items()}
+        twins = [children(parents, options.split_shrink, self.generator) for _ in range(2)]
+        added = {name: torch.cat([value[cloned], *(twin[name] for twin in twins)]) for name, value in raw.items()}
+        replace_rows(table, split, added)
         return {"cloned": int(cloned.sum()), "split": int(split.sum())} | over_cap(eligible, chosen)
 
 
 def candidates(table: ParameterTable, gradient: Float[Tensor, "N"], options: Density) -> Bool[Tensor, "N"]:
-    """Marks primitives to clone or split: by mean gradient, and as many again by mean absolute gradient.
+    """Marks primitives to clone or split by mean gradient, and as many by mean absolute gradient (Mip-Splatting).
 
-    Source: Mip-Splatting. Ours: never those without any gradient. Where none has one the published rule would choose
-    all.
+    Ours: none without any gradient; if no primitive has one, the published rule would choose all.
     """
     chosen = gradient >= options.gradient
     if not options.absolute:
@@ -136,28 +134,13 @@ def largest_scales(table: ParameterTable) -> Float[Tensor, "N"]:
     return table["log_scales"].detach().amax(1).exp()
 
 
-def clone_and_split(
-    table: ParameterTable,
-    cloned: Bool[Tensor, "N"],
-    split: Bool[Tensor, "N"],
-    shrink: float,
-    generator: torch.Generator,
-) -> None:
-    """Changes rows to survivors, clones, first children, second children."""
-    raw = detached_rows(table)
-    parents = {name: value[split] for name, value in raw.items()}
-    twins = [children(parents, shrink, generator) for _ in range(2)]
-    added = {name: torch.cat([value[cloned], *(twin[name] for twin in twins)]) for name, value in raw.items()}
-    replace_rows(table, split, added)
-
-
 def children(rows: dict[str, Tensor], shrink: float, generator: torch.Generator) -> dict[str, Tensor]:
     """Draws one child from each parent's Gaussian, `shrink` times smaller (3D-GS, densify_and_split)."""
     return rows | {"means": sampled_means(rows, generator), "log_scales": rows["log_scales"] - math.log(shrink)}
 
 
 def replace_rows(table: ParameterTable, removed: Bool[Tensor, "N"], added: dict[str, Tensor]) -> None:
-    """Appends rows, then removes the marked ones of those before."""
+    """Appends rows, then removes the marked ones of the old rows."""
     append_rows(table, added)
     new = torch.ones(len(table) - len(removed), dtype=torch.bool, device=removed.device)
     keep_rows(table, torch.cat([~removed, new]))

@@ -1,7 +1,6 @@
-"""Space that photos show to be empty: where a cut-out picture is transparent, nothing lies before the camera.
+"""Empty space: a scene lies inside the visual hull of its cut-out photos (Laurentini 1994).
 
-Random points (3D-GS starts NeRF-synthetic scenes from 100,000 in a cube) are mostly there: of all that a scene is made
-of nothing lies outside its visual hull (Laurentini 1994).
+Most random initial points lie outside it (3D-GS starts NeRF-synthetic scenes from 100,000 in a cube).
 """
 
 from collections.abc import Sequence
@@ -13,22 +12,17 @@ from gsx.core.data.scene import View
 from gsx.core.shapes import Bool, Float
 
 WITNESSES = 2
-"""Views that have to show it: one alone may have a wrong pose."""
+"""Views that must agree: one alone may have a wrong pose."""
 
 
 def in_empty_space(positions: Float[Tensor, "P 3"], views: Sequence[View]) -> Bool[Tensor, "P"]:
-    """Marks world points where at least `WITNESSES` views are transparent; none where pictures have no alpha."""
+    """Marks world points that at least `WITNESSES` views show as transparent; none without alpha channels."""
     witnesses = torch.zeros(len(positions), dtype=torch.int64, device=positions.device)
     for view in views:
         empty = view.transparent()
         if empty is not None:
-            witnesses += in_empty_pixel(positions, view, empty)
+            pixels, depths = view.camera.project(positions)
+            inside = view.camera.shows(pixels, depths)
+            column, row = torch.where(inside[:, None], pixels, 0).long().unbind(1)
+            witnesses += inside & empty.to(positions.device)[row, column]
     return witnesses >= WITNESSES
-
-
-def in_empty_pixel(positions: Float[Tensor, "P 3"], view: View, empty: Bool[Tensor, "H W"]) -> Bool[Tensor, "P"]:
-    """Marks points that a view has in an empty pixel."""
-    pixels, depths = view.camera.project(positions)
-    inside = view.camera.shows(pixels, depths)
-    column, row = torch.where(inside[:, None], pixels, 0).long().unbind(1)
-    return inside & empty.to(positions.device)[row, column]

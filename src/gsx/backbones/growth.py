@@ -1,7 +1,7 @@
-"""How anchors come and go (Scaffold-GS, adjust_anchor; Octree-GS, anchor_growing).
+"""Growing and pruning of anchors (Scaffold-GS, adjust_anchor; Octree-GS, anchor_growing).
 
-Growing looks at offsets: where an offset's Gaussian has a large screen gradient, the empty grid cell that it lies in
-gets an anchor. Scaffold-GS tries three cell sizes in turn, Octree-GS the cells of the anchor's own level and the next.
+An offset whose Gaussian has a large screen gradient grows an anchor in its grid cell, if that is empty. Scaffold-GS
+tries three cell sizes in turn, Octree-GS the cells of the anchor's own level and of the next.
 """
 
 import math
@@ -27,7 +27,7 @@ LARGEST_CELL = 2.0**53
 
 
 def fresh_statistics(count: int, offsets: int, device: torch.device | str) -> dict[str, Tensor]:
-    """Returns empty statistics of `count` anchors."""
+    """Returns statistics of `count` anchors, all 0."""
     return {
         "opacity_sum": torch.zeros(count, device=device),
         "visits": torch.zeros(count, device=device),
@@ -46,11 +46,10 @@ def observe(
     visits: Float[Tensor, "M"],
     weight: Float[Tensor, "1"],
 ) -> None:
-    """Counts one picture: visits of the anchors in view, and gradient norms of the Gaussians on screen (Scaffold-GS).
+    """Adds one picture: opacities and visits of the anchors in view, gradient norms of the Gaussians (Scaffold-GS).
 
-    `gradients` and `visits` are 0 for Gaussians without a radius; elsewhere `visits` is the weight. `opacities` are
-    summed over an anchor's offsets. Everything counts by the picture's weight in the step's loss, which gradients
-    carry already (see `backbones.density`): sums compare with numbers of steps, whatever the batch.
+    `weight` is that of the picture in the step's loss (see `backbones.density`); `visits` is 0 for Gaussians without a
+    radius, else the weight.
     """
     table["opacity_sum"][rows] += weight * opacities.sum(1)
     table["visits"][rows] += weight
@@ -59,14 +58,14 @@ def observe(
 
 
 def eligible(table: ParameterTable, least: float) -> tuple[Bool[Tensor, "N k"], Float[Tensor, "N k"]]:
-    """Returns (offsets seen in more than `least` steps, their mean gradients; 0 for the others) (Scaffold-GS)."""
+    """Returns (offsets visible in more than `least` steps, their mean gradients, 0 for the others) (Scaffold-GS)."""
     count = table["gradient_count"]
     enough = count > least
     return enough, torch.where(enough, mean_of(table["gradient_sum"], count), 0.0)
 
 
 def reset_offsets(table: ParameterTable, enough: Bool[Tensor, "N k"]) -> None:
-    """Zeroes the gradients of eligible offsets; the others keep theirs over later intervals."""
+    """Zeroes the gradients of eligible offsets; the others keep theirs."""
     for name in ("gradient_sum", "gradient_count"):
         table[name][: len(enough)][enough] = 0
 
@@ -76,11 +75,11 @@ def reset_offsets(table: ParameterTable, enough: Bool[Tensor, "N k"]) -> None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class NewAnchors:
-    """Anchors of one cell size that may be added."""
+    """Candidate anchors of one cell size."""
 
     positions: Float[Tensor, "U 3"]
     size: float
-    """Of the cell, world units: the initial length of all six scales."""
+    """Edge of the cell, the initial length of all six scales, world units."""
     parents: Int[Tensor, "P"]
     """Anchor rows whose offsets lie in a new cell."""
     group: Int[Tensor, "P"]
@@ -88,11 +87,11 @@ class NewAnchors:
     strength: Float[Tensor, "U"]
     """Largest mean gradient in the cell."""
     inherit: bool
-    """Whether the largest values of the parents are taken over."""
+    """True: anchors inherit the largest values of their parents."""
     level: int
 
     def at(self, keep: Bool[Tensor, "U"]) -> "NewAnchors":
-        """Returns the marked ones, with their parents."""
+        """Returns the marked anchors and their parents."""
         number, inside = keep.cumsum(0) - 1, keep[self.group]
         return replace(
             self,
@@ -104,7 +103,7 @@ class NewAnchors:
 
 
 class Growth:
-    """One event that adds anchors, cell size by cell size: those with the largest gradients of all sizes stay."""
+    """One event that adds anchors cell size by cell size; of all, those with the largest gradients stay."""
 
     def __init__(
         self,
@@ -115,13 +114,14 @@ class Growth:
         room: int,
         finest: float,
     ) -> None:
-        """Looks at offsets seen in more than `least` steps; at most `room` anchors come; `finest`: smallest cell."""
+        """Finds the offsets visible in more than `least` steps; `room`: most anchors; `finest`: smallest cell."""
         self.table, self.representation, self.options, self.room = table, representation, options, room
         self.old, self.proposed, self.strengths = len(table), 0, list[Tensor]()
         enough, self.gradient = eligible(table, least)
         self.row_gradient = self.gradient.sum(1) / (enough.sum(1) + 1e-6)
-        self.means = offset_means(table)
-        self.enough = enough & on_grid(self.means, finest)
+        reach = lengths(table["log_scales"].detach()[:, :3])
+        self.finest, self.means = finest, table["anchors"][:, None] + table["offsets"].detach() * reach[:, None]
+        self.enough = enough & (self.means.double().abs() < LARGEST_CELL * finest).all(2)
 
     def propose(
         self,
@@ -133,7 +133,7 @@ class Growth:
         inherit: bool = True,
         level: int = 0,
     ) -> NewAnchors:
-        """Returns new anchors in the cells of the M candidates that none of the cells taken is."""
+        """Returns new anchors in those cells of the M candidates that are not taken."""
         fresh, group = new_cells(cells, taken)
         inside = group >= 0
         return NewAnchors(
@@ -147,14 +147,14 @@ class Growth:
         )
 
     def add(self, new: NewAnchors) -> None:
-        """Appends the strongest of some new anchors, no more than there is room for in all."""
+        """Appends the new anchors with the largest gradients, at most as many as there is room for."""
         self.proposed += len(new.positions)
         new = new.at(within_room(torch.ones_like(new.strength, dtype=torch.bool), new.strength, self.room))
         add_anchors(self.table, new, self.representation)
         self.strengths.append(new.strength)
 
     def within_room(self) -> tuple[int, int]:
-        """Removes the weakest of those appended that are too many; returns (how many stay, how many had no room)."""
+        """Removes the weakest appended anchors beyond the room; returns (number added, number without room)."""
         strengths = torch.cat([*self.strengths, self.table["anchors"].new_zeros(0)])
         if len(strengths) > self.room:
             new = within_room(torch.ones_like(strengths, dtype=torch.bool), strengths, self.room)
@@ -164,19 +164,19 @@ class Growth:
 
 
 class DepthGrowth(Growth):
-    """Scaffold-GS: three cell sizes in turn, a random part of the candidates each (anchor_growing)."""
+    """Growth of Scaffold-GS: three cell sizes in turn, a random part of the candidates each (anchor_growing)."""
 
-    def grow(self, voxel: float, early_stop: bool, generator: torch.Generator) -> tuple[int, int]:
-        """Adds anchors; returns (how many, how many had no room)."""
+    def grow(self, early_stop: bool, generator: torch.Generator) -> tuple[int, int]:
+        """Adds anchors; returns (number added, number without room)."""
         options = self.options
         for depth in range(options.depths):
             multiple = options.coarsest // options.hierarchy**depth
-            if multiple == 0:  # the reference divides by it (Scaffold-GS, anchor_growing)
+            if multiple == 0:  # the reference divides by it
                 continue
             chance = torch.rand(self.enough.shape, generator=generator).to(self.enough.device)
             threshold = options.gradient * (options.hierarchy // 2) ** depth
             candidates = self.enough & (self.gradient >= threshold) & (chance > 0.5 ** (depth + 1))
-            size = voxel * multiple
+            size = self.finest * multiple
             cells, taken = nodes_of(self.means[candidates], size), nodes_of(self.table["anchors"], size)
             self.add(self.propose(candidates, cells, taken, 0.0, size))
             if early_stop and self.proposed == 0:
@@ -185,61 +185,66 @@ class DepthGrowth(Growth):
 
 
 class LevelGrowth(Growth):
-    """Octree-GS: cells of the own level, and of the next one for the strongest gradients (anchor_growing)."""
+    """Growth of Octree-GS: cells of the own level, and of the next for the largest gradients (anchor_growing)."""
 
-    def grow(self, levels: Levels, quirks: Quirks, gate: bool) -> tuple[int, int]:
-        """Adds anchors; returns (how many, how many had no room). `gate`: whether promotion and bias take place."""
-        taus = thresholds(self.options.gradient, levels.fork, self.options.update_ratio, levels.count + 1)
-        level_of = self.table["level"].clone()
-        for level in range(levels.count):
-            on_level = level_of == level
-            if not bool(on_level.any()):
-                continue
-            if gate:
-                self.add_bias(on_level, taus[level], quirks.bias)
-            for new in self.of_level(level, self.enough & on_level[:, None], taus, levels, quirks, gate):
-                self.add(new)
-        return self.within_room()
-
-    def add_bias(self, on_level: Bool[Tensor, "N"], threshold: float, rule: str) -> None:
-        """Lets anchors with larger gradients be drawn from a little farther (Octree-GS, anchor_growing)."""
-        bias = self.table["bias"]
-        chosen = self.row_gradient >= self.options.bias_gradient * threshold
-        if rule != "all":
-            chosen = chosen & on_level
-        bias[: len(chosen)] += self.options.bias_step * chosen
-        if rule == "own":
-            bias.clamp_max_(1.0)
-
-    def of_level(
+    def __init__(
         self,
-        level: int,
-        enough: Bool[Tensor, "N k"],
-        taus: tuple[float, ...],
+        table: ParameterTable,
+        representation: Representation,
+        options: GrowthOptions,
+        least: float,
+        room: int,
         levels: Levels,
         quirks: Quirks,
         gate: bool,
-    ) -> Iterator[NewAnchors]:
-        """Yields anchors on the same level, then promotions to the next (Octree-GS, anchor_growing)."""
-        last, overlap = level == levels.count - 1, self.options.overlap
-        below = self.gradient < taus[level + 1]
+    ) -> None:
+        """Finds the offsets as `Growth` does; `gate`: allow promotion and bias."""
+        super().__init__(table, representation, options, least, room, levels.size(levels.count - 1))
+        self.levels, self.quirks, self.gate = levels, quirks, gate
+        self.taus = thresholds(options.gradient, levels.fork, options.update_ratio, levels.count + 1)
+
+    def grow(self) -> tuple[int, int]:
+        """Adds anchors; returns (number added, number without room)."""
+        level_of = self.table["level"].clone()
+        for level in range(self.levels.count):
+            on_level = level_of == level
+            if not bool(on_level.any()):
+                continue
+            if self.gate:
+                self.add_bias(level, on_level)
+            for new in self.of_level(level, self.enough & on_level[:, None]):
+                self.add(new)
+        return self.within_room()
+
+    def add_bias(self, level: int, on_level: Bool[Tensor, "N"]) -> None:
+        """Raises the level bias of anchors with large gradients: they are drawn from farther (Octree-GS)."""
+        bias = self.table["bias"]
+        chosen = self.row_gradient >= self.options.bias_gradient * self.taus[level]
+        if self.quirks.bias != "all":
+            chosen = chosen & on_level
+        bias[: len(chosen)] += self.options.bias_step * chosen
+        if self.quirks.bias == "own":
+            bias.clamp_max_(1.0)
+
+    def of_level(self, level: int, enough: Bool[Tensor, "N k"]) -> Iterator[NewAnchors]:
+        """Yields anchors on the same level, then promotions to the next (Octree-GS)."""
+        last, overlap, quirks = level == self.levels.count - 1, self.options.overlap, self.quirks
+        below = self.gradient < self.taus[level + 1]
         if last and quirks.finest == "open":
             below = torch.ones_like(below)
-        staying = enough & (self.gradient >= taus[level]) & below
-        yield self.at_level(staying, level, level, levels)
-        if gate and not last and (overlap or bool((self.table["level"] == level + 1).any())):
+        staying = enough & (self.gradient >= self.taus[level]) & below
+        yield self.at_level(staying, level, level)
+        if self.gate and not last and (overlap or bool((self.table["level"] == level + 1).any())):
             compared = level if quirks.duplicates == "own" else level + 1
-            promoted = enough & (self.gradient >= taus[level + 1])
-            yield self.at_level(promoted, level + 1, compared, levels, overlap or quirks.promoted == "max")
+            promoted = enough & (self.gradient >= self.taus[level + 1])
+            yield self.at_level(promoted, level + 1, compared, overlap or quirks.promoted == "max")
 
-    def at_level(
-        self, candidates: Bool[Tensor, "N k"], level: int, compared: int, levels: Levels, inherit: bool = True
-    ) -> NewAnchors:
-        """Returns anchors in cells of a level that no anchor of level `compared` holds, and enough cameras would draw.
+    def at_level(self, candidates: Bool[Tensor, "N k"], level: int, compared: int, inherit: bool = True) -> NewAnchors:
+        """Returns anchors that enough cameras draw, in cells of a level without an anchor of level `compared`.
 
-        With overlap in all cells (Octree-GS, weed_out).
+        With overlap in any cell (Octree-GS, weed_out).
         """
-        occupied = self.table["anchors"][self.table["level"] == compared]
+        levels, occupied = self.levels, self.table["anchors"][self.table["level"] == compared]
         taken = levels.cells(occupied[:0] if self.options.overlap else occupied, level)
         cells, size = levels.cells(self.means[candidates], level), levels.size(level)
         new = self.propose(candidates, cells, taken, levels.origin, size, inherit, level)
@@ -247,19 +252,8 @@ class LevelGrowth(Growth):
         return new.at(kept(levels, new.positions, of))
 
 
-def offset_means(table: ParameterTable) -> Float[Tensor, "N k 3"]:
-    """Returns the place of every offset's Gaussian, world units."""
-    reach = lengths(table["log_scales"].detach()[:, :3])
-    return table["anchors"][:, None] + table["offsets"].detach() * reach[:, None]
-
-
-def on_grid(means: Float[Tensor, "N k 3"], size: float) -> Bool[Tensor, "N k"]:
-    """Marks places whose cells of that size have a number: finite ones within 2^53 cells."""
-    return (means.double().abs() < LARGEST_CELL * size).all(2)
-
-
 def nodes_of(positions: Float[Tensor, "M 3"], size: float) -> Int[Tensor, "M 3"]:
-    """Returns the nearest node of a grid through the world's origin, halves to even."""
+    """Returns the nearest nodes of a grid through the world's origin, halves to even."""
     return (positions.double() / size).round().long()
 
 
@@ -283,18 +277,18 @@ def add_anchors(table: ParameterTable, new: NewAnchors, representation: Represen
 
 
 def prune(table: ParameterTable, options: GrowthOptions, least: float) -> int:
-    """Removes anchors that were visited often and stayed faint; returns how many (Scaffold-GS, adjust_anchor)."""
+    """Removes anchors that stayed faint in more than `least` visits; returns how many (Scaffold-GS, adjust_anchor)."""
     ready = table["visits"] > least
     faint = ready & (table["opacity_sum"] < options.prune_opacity * table["visits"])
     for name in ("opacity_sum", "visits"):
         table[name][ready] = 0
-    if bool(faint.all()):  # a cloud about to vanish keeps what it has
+    if bool(faint.all()):  # an empty model cannot recover
         return 0
     keep_rows(table, ~faint)
     return int(faint.sum())
 
 
 def clamp_scales(table: ParameterTable, largest: float) -> None:
-    """Holds the log-scales of the Gaussians, not the reach of the offsets, below a limit (Scaffold-GS)."""
+    """Clamps the log-scales of the Gaussians, not those of the offsets (Scaffold-GS)."""
     with torch.no_grad():
         table["log_scales"][:, 3:].clamp_(max=largest)

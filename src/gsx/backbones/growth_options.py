@@ -1,4 +1,4 @@
-"""Options of growth, and the switches of the references' quirks."""
+"""Options of growth, and switches of the references' quirks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,35 +10,34 @@ from gsx.core.ranges import Gradient, Interval, Range, Share, Steps
 
 @dataclass(frozen=True, kw_only=True)
 class GrowthOptions:
-    """Numbers of growing and pruning, in steps of the published run; values in conf/backbone, with their sources."""
+    """Options of growing and pruning, steps of the published run; values in conf/backbone, with their sources."""
 
     observe_from: Steps
     start: Steps
     stop: Steps
     every: Interval
     success: Share
-    """Fraction of an interval's steps in which an anchor must have been visited before it is judged; offsets: half.
-    Of a step's views each counts by its weight in the loss."""
+    """Fraction of an interval's steps with visits that an anchor needs before it may be pruned; offsets: half."""
     gradient: Gradient
     """Mean NDC gradient above which an offset grows an anchor."""
     prune_opacity: Share
     """Anchors whose opacities sum to less than this per visit are removed."""
     largest_log_scale: Annotated[float, Range(-100, 100)]
-    """While growing, log-scales of the Gaussians are held below this; see `Quirks.clamp`."""
+    """Upper bound of the Gaussians' log-scales while growing; see `Quirks.clamp`."""
     depths: Annotated[int, Range(1, 20)]
-    """Without levels: sizes of cells tried in turn."""
+    """Without levels: number of cell sizes."""
     hierarchy: Annotated[int, Range(2, 64)]
-    """Without levels: each size is this much smaller, its threshold half as many times larger."""
+    """Without levels: ratio of one cell size to the next; thresholds grow by half of it."""
     coarsest: Annotated[int, Range(1, 10**6)]
-    """Without levels: voxels along the largest cell."""
+    """Without levels: edge of the largest cell, voxels."""
     update_ratio: Annotated[float, Range(0, 100)]
     """With levels: the threshold grows by fork ** this per level."""
     bias_gradient: Annotated[float, Range(0, 100)]
-    """With levels: anchors with this fraction of the threshold are drawn from a little farther."""
+    """With levels: fraction of the threshold above which an anchor is drawn from farther away."""
     bias_step: Annotated[float, Range(0, 100)]
-    """With levels: by how much, in levels."""
+    """With levels: increase of its level bias, in levels."""
     overlap: bool
-    """With levels: cells that hold an anchor may get another."""
+    """With levels: True allows a second anchor in a cell."""
 
     def __post_init__(self) -> None:
         if not self.success > 0:
@@ -47,26 +46,26 @@ class GrowthOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Quirks:
-    """Behaviour of the reference code that published numbers depend on; '' takes the value of `fidelity`."""
+    """Quirks of the reference code that published numbers depend on; '' takes the value of `fidelity`."""
 
     early_stop: str
-    """yes: if the coarsest cells grow nothing, finer ones are not tried (Scaffold-GS)."""
+    """yes: stop if the coarsest cells grow nothing (Scaffold-GS)."""
     clamp: str
-    """world: log-scales are held below growth.largest_log_scale of world units; extent: of the extent."""
+    """Unit of growth.largest_log_scale: world units, or the scene's extent."""
     voxel: str
-    """squared: the automatic voxel is the median mean SQUARED neighbour distance (Scaffold-GS); distance: its root."""
+    """Automatic voxel, squared: the median mean SQUARED neighbour distance (Scaffold-GS); distance: its root."""
     gate: str
-    """open: promotion and bias from the first growth (a bug of Octree-GS); closed: once all levels are in training.
-    Of free Gaussians: splits and their bias."""
+    """Promotion and bias (free Gaussians: splits and bias), open: from the start (a bug of Octree-GS); closed: once all
+    levels are in training."""
     bias: str
-    """all: bias also anchors of other levels, without limit (Octree-GS); level: of the level at hand, without limit
-    (Octree-AnyGS, GSOctree); own: of the level at hand, at most 1."""
+    """all: anchors of all levels get bias, without limit (Octree-GS); level: those of the level at hand, without limit
+    (Octree-AnyGS, GSOctree); own: those of the level at hand, at most 1."""
     finest: str
-    """bounded: the strongest gradients of the finest level grow nothing (Octree-GS); open: they do."""
+    """bounded: the largest gradients of the finest level grow nothing (Octree-GS); open: they do."""
     promoted: str
-    """zeros: features of anchors promoted to the next level (Octree-GS); max: of their parents."""
+    """Features of promoted anchors, zeros: 0 (Octree-GS); max: the largest of their parents."""
     duplicates: str
-    """next: promotion looks for a free cell among the next level's; own: its own, as in published tables (a bug)."""
+    """Level whose free cells promotion uses, next: the next one's; own: its own, as in published tables (a bug)."""
 
 
 CHOICES = {
@@ -85,10 +84,9 @@ FIDELITIES = {"reference": {name: values[0] for name, values in CHOICES.items()}
 
 
 def resolved(quirks: Quirks, fidelity: str, published: Mapping[str, str] = MappingProxyType({})) -> Quirks:
-    """Sets every switch that is '' by the fidelity; `published`: where this reference differs from `CHOICES`.
+    """Sets every switch that is '' by the fidelity; ValueError: a value is unknown.
 
-    Raises:
-        ValueError: a value is unknown; it and the known ones are named.
+    `published`: quirks in which this reference differs from `CHOICES`.
     """
     if fidelity not in FIDELITIES:
         raise ValueError(f"backbone.fidelity is '{fidelity}'; choose {' or '.join(FIDELITIES)}")

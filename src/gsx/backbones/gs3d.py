@@ -1,12 +1,10 @@
 """3D Gaussian Splatting (Kerbl et al. 2023): explicit Gaussians with adaptive density control (3D-GS)."""
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import Parameter
 from torch.nn.functional import normalize
 
 from gsx.backbones.capacity import MOST_VIEWS
@@ -21,18 +19,16 @@ from gsx.backbones.scene_model import SceneModel
 from gsx.backbones.sh_degrees import ChosenDegrees, choose_degrees, hold_bands, lower_degrees, numbers_of
 from gsx.backbones.sky import NOTHING, SKY_OPACITY, WIDEST, far_away, sky_behind
 from gsx.backbones.visibility import Visibility, VisibleGaussians, everything, extents
-from gsx.core.backend import EAGER, Backend
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
-from gsx.core.gaussians.quaternions import make_identity_where_zero
 from gsx.core.gaussians.sh import colours_of, constant_from_colour, degree_of
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering
-from gsx.core.shapes import Float, Int
+from gsx.core.shapes import Int
 from gsx.core.training.backbone import BackboneContext, DrawnSplats, Observation
 from gsx.core.training.importance import Probe, random_views
-from gsx.core.training.parameter_table import ParameterTable, take_adam_step
+from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.schedule import log_linear
 from gsx.formats.smoothing import logit_of_log, unsmoothed
 from gsx.formats.splat_files import columns_of
@@ -53,29 +49,17 @@ def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> di
 
 
 def raw_parameters(gaussians: Gaussians, sh_degree: int) -> dict[str, Tensor]:
-    """Returns raw parameters of Gaussians with colours of that degree; bands that they lack are zero.
-
-    Raises:
-        InputError: they have more bands.
-    """
+    """Returns raw parameters of Gaussians with missing bands set to 0; InputError: they have more bands."""
     rest, bands = gaussians.sh_rest, (sh_degree + 1) ** 2 - 1
     if rest.shape[1] > bands:
         degree = degree_of(rest.shape[1])
-        raise InputError(f"init: the file has colours of degree {degree}, backbone.sh_degree is {sh_degree}: raise it")
+        raise InputError(f"init: the file has SH degree {degree}, backbone.sh_degree is {sh_degree}: raise it")
     missing = rest.new_zeros(len(rest), bands - rest.shape[1], 3)
     return vars(gaussians) | {"sh_dc": gaussians.sh_dc[:, None], "sh_rest": torch.cat([rest, missing], 1)}
 
 
-def colours_from(
-    camera: Camera, values: Mapping[str, Tensor], degree: int, backend: Backend = EAGER
-) -> Float[Tensor, "M 3"]:
-    """Evaluates colours of Gaussians as seen from a camera, up to a degree."""
-    offsets = offsets_from(values["means"], camera.centre)
-    return colours_of(values["sh_dc"], values["sh_rest"], offsets, degree, backend)
-
-
 def choose_sh_degrees(model: "GS3D", step: int) -> dict[str, float]:
-    """Keeps the bands of colour that change renders of training views by more than their price."""
+    """Keeps the colour bands of each Gaussian that change renders of training views by more than their price."""
     highest, context, price = model.active_degree(step), model.context, model.options.sh_price
     if not highest:
         return {}
@@ -107,12 +91,12 @@ class GS3D(SceneModel):
         self.filter = filter_named(options.filter, options.mip, context, self.schedule, control.events.stop)
         self.raster = self.filter.rules(context.raster)
         self.absolute_gradient = options.density.absolute or self.capacity.ranked
-        self.first_degree, self.sh_degree = 0, options.sh_degree
-        self.table = self.initial_table(context.points(), context.device)
+        self.first_degree, self.sh_degree, self.volume_weight = 0, options.sh_degree, control.volume_weight
+        self.table = self.initial_table(context.points())
         self.filter.refresh(self.table, self.table["means"])
 
-    def initial_table(self, points: PointCloud, device: torch.device) -> ParameterTable:
-        """Builds a Gaussian for each point that visibility starts from, and for each of the sky, if there is one."""
+    def initial_table(self, points: PointCloud) -> ParameterTable:
+        """Builds a Gaussian for each initial point, and for each point of the sky."""
         points, columns = self.visibility.start(points)
         raw = initial_parameters(points, self.options.sh_degree, self.options.initial_opacity)
         if self.options.sky != "never":
@@ -121,36 +105,29 @@ class GS3D(SceneModel):
             behind["log_scales"].clamp_(math.log(sky.spacing), math.log(WIDEST * sky.spacing))
             raw = {name: torch.cat([value, behind[name]]) for name, value in raw.items()}
             columns = columns | {"sky": (torch.arange(len(raw["means"])) >= len(points)).to(torch.int8)}
-        return self.table_of(raw, columns, device)
+        return self.table_of(raw, columns)
 
-    def table_of(self, raw: dict[str, Tensor], columns: dict[str, Tensor], device: torch.device) -> ParameterTable:
-        """Builds a table of raw parameters and columns, with empty statistics."""
+    def table_of(self, raw: dict[str, Tensor], columns: dict[str, Tensor]) -> ParameterTable:
+        """Builds a table of raw parameters and columns, with statistics 0."""
+        count = len(raw["means"])
         if self.options.sh_judged > 0:
-            degrees = torch.full((len(raw["means"]),), self.options.sh_degree, dtype=torch.int8)
-            columns = columns | {"sh_degree": degrees}
-        table = ParameterTable(
-            {name: Parameter(value.to(device)) for name, value in raw.items()},
-            {name: value.to(device) for name, value in columns.items()},
-            gradient_statistics(len(raw["means"]), device, self.absolute_gradient),
-            former_names={"sh_dc": "sh_constant"},
-        )
-        self.capacity.initialise(table)
-        return table
+            columns = columns | {"sh_degree": torch.full((count,), self.options.sh_degree, dtype=torch.int8)}
+        return self.new_table(raw, columns, gradient_statistics(count, self.context.device, self.absolute_gradient))
 
     def start_from(self, gaussians: Gaussians) -> None:
-        """Takes Gaussians of a file, which are drawn as they are: it first takes off what the 3D filter adds.
+        """Replaces the model by Gaussians of a file; it removes the 3D filter first, so that renders stay equal.
 
         Raises:
-            InputError: they have more bands of colour than the model, or the model has levels, which no file tells.
+            InputError: they have more bands than the model, or the model has levels.
         """
         if self.visibility.by_level:
-            raise InputError("init: a splat file says nothing of levels: choose backbone=gs3d or mip_splatting")
-        raw, device = raw_parameters(gaussians, self.options.sh_degree), self.table["means"].device
+            raise InputError("init: a splat file has no levels: choose backbone=gs3d or mip_splatting")
+        raw = raw_parameters(gaussians, self.options.sh_degree)
         self.first_degree = self.options.sh_degree
         columns = {}
         if self.options.sky != "never":
             columns["sky"] = far_away(raw["means"], self.context.scene).to(torch.int8)
-        self.table = self.table_of(raw, columns, device)
+        self.table = self.table_of(raw, columns)
         self.filter.refresh(self.table, self.table["means"])
         if "filter" in self.table.columns:
             with torch.no_grad():
@@ -166,26 +143,23 @@ class GS3D(SceneModel):
         return max(self.first_degree, min(self.options.sh_degree, grown))
 
     def draw(self, camera: Camera, step: int) -> DrawnSplats:
-        """Returns the Gaussians that the camera draws, with their colours as seen from there."""
+        """Returns the Gaussians that the camera draws, with their colours towards it."""
         visible = self.visibility.visible(self.table, camera, step)
         values = visible.values
         scales, log_opacities = extents(self.table, visible, self.filter)
+        offsets, degree = offsets_from(values["means"], camera.centre), self.active_degree(step)
         backend = self.raster.backend.on(scales.device.type, learning=True)
         splats = Splats(
             means=values["means"],
             scales=scales,
             quats=values["quats"],
             log_opacities=log_opacities,
-            colours=colours_from(camera, values, self.active_degree(step), backend),
+            colours=colours_of(values["sh_dc"], values["sh_rest"], offsets, degree, backend),
         )
         return DrawnSplats(splats=splats, rows=visible.rows)
 
-    def regulariser(self, drawn: DrawnSplats) -> Float[Tensor, ""] | None:
-        """Returns that of density control; 3D-GS has none."""
-        return self.control.regulariser(drawn)
-
     def observe(self, drawn: DrawnSplats, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
-        """Returns screen gradients, which count until density control ends (3D-GS, train.py)."""
+        """Returns screen gradients until density control ends (3D-GS, train.py)."""
         if step >= self.control.events.stop:
             return {}
         return densification_statistics(rendering.screen, drawn.rows, weight)
@@ -202,7 +176,7 @@ class GS3D(SceneModel):
         if metrics or self.filter.due(step):
             before = self.table.columns.get("filter")
             self.filter.refresh(self.table, self.table["means"], step)
-            if before is not None and self.filter.narrows(step):  # the picture goes on as it was
+            if before is not None and self.filter.narrows(step):  # renders stay equal
                 absorb(self.table, before, self.table["filter"])
         if self.control.reset_due(step):
             self.control.reset_opacities(self.table, self.filter)
@@ -220,7 +194,7 @@ class GS3D(SceneModel):
         return round(self.options.sh_judged * self.schedule.iterations)
 
     def means_rate_steps(self) -> int:
-        """Returns the step at which the learning rate of the means has come down."""
+        """Returns the step at which the learning rate of the means reaches its last value."""
         return self.schedule.step(self.options.decay_until or self.options.published_iterations)
 
     def set_rates(self, step: int) -> None:
@@ -233,25 +207,20 @@ class GS3D(SceneModel):
             self.table.set_rate(name, faster * getattr(rates, name))
 
     def update(self, step: int) -> None:
-        """Takes one Adam step. Unused SH bands take part with zero gradients, as in the published code (3D-GS)."""
-        rest = self.table["sh_rest"]
-        if rest.grad is None and self.table["sh_dc"].grad is not None:
-            rest.grad = torch.zeros_like(rest)
+        """Takes one Adam step; bands above the chosen degrees stay 0."""
         if "sh_degree" in self.table.columns and step >= self.sh_step():
             hold_bands(self.table)
-        self.set_rates(step)
-        take_adam_step(self.table)
-        make_identity_where_zero(self.table["quats"])
+        super().update(step)
 
     # -- files and logs ----------------------------------------------------------------------------------------
 
     def explicit(self, camera: Camera | None, step: int) -> Gaussians:
-        """Returns Gaussians of a splat file: those the camera draws, without a camera all."""
+        """Returns Gaussians of a splat file: those that the camera draws, or all without a camera."""
         visible = everything(self.table) if camera is None else self.visibility.visible(self.table, camera, step)
         return self.gaussians(visible)
 
     def gaussians(self, visible: VisibleGaussians) -> Gaussians:
-        """Returns parameters as in a splat file, the 3D filter fused into scales and opacities (Mip-Splatting)."""
+        """Returns parameters of a splat file with the 3D filter fused into scales and opacities (Mip-Splatting)."""
         raw = {name: visible.values[name].detach() for name in self.table.parameters}
         if self.filter.note or visible.weights is not None:
             scales, log_opacities = extents(self.table, visible, self.filter)
@@ -270,7 +239,7 @@ class GS3D(SceneModel):
         return rows, rows
 
     def file_columns(self) -> dict[str, Tensor] | None:
-        """Returns the standard 62 properties (3D-GS, save_ply), with columns of visibility where normals would be."""
+        """Returns the standard properties with visibility's columns in place of normals; None if it has none."""
         more = self.visibility.columns(self.table)
         if not more:
             return None
@@ -279,7 +248,7 @@ class GS3D(SceneModel):
         return {axis: columns[axis] for axis in "xyz"} | more | rest
 
     def file_notes(self) -> list[str]:
-        """Returns whether the 3D filter is in the file, and notes of visibility."""
+        """Returns comments on the 3D filter and on visibility."""
         return [self.filter.note or "no 3D filter", *self.visibility.notes()]
 
     def plan(self) -> dict[str, Any]:

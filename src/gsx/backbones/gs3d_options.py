@@ -21,8 +21,8 @@ class Rates:
     log_scales: Rate
     quats: Rate
     shortened: Share = 0.0
-    """In a run of fewer steps than published, all but that of opacities are (published / taken)^shortened times as
-    high, that of means at first; 0: as published."""
+    """In a run shorter than published, all rates but that of opacities (of means: the first) grow by
+    (published steps / steps)^shortened; 0: as published."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,18 +35,18 @@ class Density:
     gradient: Gradient
     """Mean NDC gradient at or above which a primitive is cloned or split."""
     absolute: bool
-    """Also clone or split as many again by the mean of absolute gradients (Mip-Splatting, densify_and_prune)."""
+    """Also clone or split as many by the mean absolute gradient (Mip-Splatting, densify_and_prune)."""
     split_extent: Annotated[float, Range(0, 1e6)]
-    """Primitives larger than this fraction of the extent are split, smaller ones cloned."""
+    """Fraction of the extent above which primitives are split instead of cloned."""
     split_shrink: Annotated[float, Range(1, 100)]
-    """Children are the parent's scale divided by this."""
+    """Scale of a parent over that of its children."""
     prune_opacity: Share
     prune_extent: Annotated[float, Range(0, 1e6)]
-    """Primitives larger than this fraction of the extent are removed, after the first opacity reset."""
+    """Fraction of the extent above which primitives are removed, after the first opacity reset."""
     reset_every: Interval
     reset_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)]
     reset_passes: Annotated[float, Range(0, 1e6)]
-    """In a shortened run at least this many passes over the views lie between opacity resets."""
+    """Least passes over the views between opacity resets, in a shortened run."""
     white_reset: Steps
     """Step of the extra opacity reset on a white background."""
 
@@ -62,17 +62,17 @@ class GS3DOptions(CapacityOptions):
     sh_degree: Annotated[int, Range(0, 3)]
     sh_every: Interval
     sh_judged: Share = 0.0
-    """Share of the run after which every Gaussian keeps the SH bands that are worth their numbers; 0: it keeps all."""
+    """Share of the run after which each Gaussian keeps only SH bands worth their numbers; 0: it keeps all."""
     sh_price: Annotated[float, Range(1e-6, 100)] = 0.8
-    """dB that a doubling of all numbers of the model has to bring."""
+    """Least gain of a doubling of the model's numbers, dB."""
     sky: str = "never"
-    """Whether Gaussians far away stand behind the scene (`backbones.sky`); auto: where photographs look past it."""
+    """Distant Gaussians behind the scene (`backbones.sky`), never, always, or auto: if photos look past the scene."""
     initial_opacity: Annotated[float, Range(1e-6, 1 - 1e-6)]
     rates: Rates
     density: Density
     mip: MipOptions
     decay_until: Steps = 0
-    """Published step at which the rate of the means has come down; 0: at the end of the run."""
+    """Published step at which the rate of the means reaches its last value; 0: the end of the run."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,4 +1,4 @@
-"""The small networks that turn an anchor, seen from a camera, into Gaussians (Scaffold-GS)."""
+"""Small networks that decode an anchor into Gaussians for one camera (Scaffold-GS)."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from gsx.core.ranges import Range
 from gsx.core.shapes import Float
 
 LEAST_DISTANCE = 1e-8
-"""World units; a camera exactly at an anchor has no direction to it (Scaffold-GS, generate_neural_gaussians)."""
+"""Lower bound of distances whose direction is taken, world units (Scaffold-GS, generate_neural_gaussians)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class HeadOptions:
     bank: bool
     """Mix the feature with coarser copies of itself by view (Scaffold-GS, gaussian_model.py)."""
     bank_distance: bool
-    """The bank sees the distance as well as the direction (Scaffold-GS yes, Octree-GS no)."""
+    """Feed the distance to the bank (Scaffold-GS yes, Octree-GS no)."""
     opacity_distance: bool
     covariance_distance: bool
     colour_distance: bool
@@ -32,9 +32,9 @@ class HeadOptions:
     level: bool
     """Feed an anchor's level to every head and to the bank (Octree-GS: add_level)."""
     appearance: Annotated[int, Range(0, 1024)]
-    """Length of a training view's code, seen by the colour head; 0: none."""
+    """Length of a training view's appearance code, an input of the colour head; 0: none."""
     appearance_code: Annotated[int, Range(-1, 10**6)]
-    """Code of any other camera: a training view's number; -1: the mean of all codes."""
+    """Training view whose code all other cameras use; -1: the mean of all codes."""
 
     def __post_init__(self) -> None:
         if self.features % 4:
@@ -58,7 +58,7 @@ def head(inputs: int, width: int, outputs: int, last: nn.Module, generator: torc
 
 
 def tiled(feature: Float[Tensor, "A C"], stride: int) -> Float[Tensor, "A C"]:
-    """Takes every `stride`-th value and repeats the whole sub-vector (not each value)."""
+    """Takes every `stride`-th value and tiles the sub-vector to full length."""
     return feature[:, ::stride].repeat(1, stride)
 
 
@@ -121,6 +121,6 @@ class Heads(nn.Module):
         return sum((weights[:, i : i + 1] * part for i, part in enumerate(parts)), start=torch.zeros_like(feature))
 
     def code(self, view: int) -> Float[Tensor, "A"]:
-        """Returns the appearance code of a training view, or the one chosen for all other cameras."""
+        """Returns the appearance code of a training view, or that of all other cameras."""
         number = view if view >= 0 else self.options.appearance_code
         return self.appearance.weight[number] if number >= 0 else self.appearance.weight.mean(0)

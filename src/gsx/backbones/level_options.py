@@ -20,34 +20,31 @@ class LevelOptions:
     first: Annotated[int, Range(-1, 32)]
     """Highest level at the start; -1: half of them (Octree-GS, set_level)."""
     base_layer: Annotated[int, Range(-1, 64)]
-    """Forks from the whole box to a cell of level 0; -1: such that the middle level has cells of `voxel`."""
+    """Forks from the whole box to a cell of level 0; -1: the middle level has cells of `voxel`."""
     voxel: Length
-    """Cell of the middle level where base_layer is -1, scene units."""
+    """Cell of the middle level if base_layer is -1, scene units."""
     distance_quantile: Share
-    """Distances between this quantile and its mirror count, per camera and over cameras (Octree-GS, set_level)."""
+    """Upper quantile of distances, per camera and over cameras; the lower one mirrors it (Octree-GS, set_level)."""
     extend: Annotated[float, Range(1, 1000)]
-    """The box is the points' range of coordinates times this (Octree-GS, octree_sample)."""
+    """Length of the box over the range of the points' coordinates (Octree-GS, octree_sample)."""
     extend_rule: str
-    """reference: both ends of the range are multiplied, so that far from the origin the box misses points; sane: the
-    box grows on both sides wherever it lies, to the same length (Octree-GS); '': as backbone.fidelity says."""
+    """reference: multiply both ends of the range, which misses points far from the origin (Octree-GS); sane: extend the
+    box equally on both sides; '': by backbone.fidelity."""
     visible_threshold: Annotated[float, Range(-1, 1)]
-    """A primitive is kept if more than this fraction of the training cameras draw its level; -1: the mean of that
-    fraction (Octree-GS, weed_out)."""
+    """Least fraction of training cameras that draw a primitive's level; -1: the mean fraction (Octree-GS, weed_out)."""
     mode: str
-    """How a level becomes whole: round, floor, ceil, or progressive, which fades the finest level in (Octree-GS)."""
+    """Rounding of levels: round, floor, ceil, or progressive, which fades the finest level in (Octree-GS)."""
     half_cell: bool | None
-    """Distances are taken to a point half a cell beyond the node, as the reference does (Octree-GS); None: as
-    backbone.fidelity says."""
+    """True: measure distances to a point half a cell beyond the node (Octree-GS); None: by backbone.fidelity."""
     zoom: str
-    """What cameras finer than those of training draw. finer: the levels that belong to their resolution, as the
-    reference does, trained there or not; training: none that the finest training camera would not draw."""
+    """Levels of cameras finer than those of training, finer: those of their resolution, trained or not (Octree-GS);
+    training: at most those of the finest training camera."""
     coarse_until: Steps
-    """Published step at which all levels take part in training (Octree-GS, set_coarse_interval); 0: from the start."""
+    """Published step at which all levels are in training (Octree-GS, set_coarse_interval); 0: from the start."""
     coarse_factor: Annotated[float, Range(1, 1000)]
-    """Each interval between two levels is this much shorter than the one before (Octree-GS, set_coarse_interval)."""
+    """Ratio of each interval between two levels to the next (Octree-GS, set_coarse_interval)."""
     cell_pixels: Annotated[float, Range(0, 1000)] = 0.0
-    """Ours: no more forks for the base layer than leave its cells so many pixels at the farthest; 0: whatever
-    base_layer and voxel say. The default: runs older than this option."""
+    """Ours: least size of a cell of level 0 at the farthest distance, px; 0: no limit, as in runs older than this."""
 
     def __post_init__(self) -> None:
         threshold, rules = self.visible_threshold, ", ".join(EXTEND_RULES) + ", or '' for backbone.fidelity's"
@@ -59,13 +56,13 @@ class LevelOptions:
         self.demand("visible_threshold", threshold == -1 or 0 <= threshold < 1, "give -1, or from 0 to below 1")
 
     def demand(self, name: str, met: bool, advice: str) -> None:
-        """Refuses a value that does not meet a condition."""
+        """Raises ValueError if an option's condition is not met."""
         if not met:
             raise ValueError(f"backbone.levels.{name} is {getattr(self, name)!r}; {advice}")
 
 
 def faithful(options: LevelOptions | None, fidelity: str) -> LevelOptions | None:
-    """Returns the options with open switches of the reference's quirks set by the fidelity."""
+    """Returns the options with unset quirks of the reference set by the fidelity."""
     if options is None:
         return None
     half_cell = fidelity == "reference" if options.half_cell is None else options.half_cell
@@ -73,9 +70,9 @@ def faithful(options: LevelOptions | None, fidelity: str) -> LevelOptions | None
 
 
 def checked_end(options: LevelOptions | None, published: int) -> None:
-    """Refuses a schedule that ends with levels that never took part in training."""
+    """Raises ValueError if the finest levels would never be trained."""
     if options is not None and options.coarse_until >= published:
         raise ValueError(
             f"backbone.levels.coarse_until is {options.coarse_until}, and the published run "
-            f"(backbone.published_iterations) ends at {published}: the finest level would never train; give less"
+            f"(backbone.published_iterations) ends at {published}, so the finest level would never train: lower it"
         )

@@ -1,7 +1,7 @@
-"""Levels of detail over any representation: which primitives a camera at a given distance sees (Octree-GS).
+"""Levels of detail over any representation (Octree-GS).
 
-Level 0 is the coarsest; a camera at distance d draws every level up to log_f(D / (s d)): coarse levels always, finer
-ones are added. There are no pointers between levels, only nested grids with cells of v / f^L.
+Level 0 is the coarsest; a camera at distance d draws all levels up to log_f(D / (s d)). Level L is a grid with cells of
+v / f^L; levels do not point to each other.
 """
 
 import math
@@ -20,37 +20,37 @@ from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.schedule import Schedule
 
 BELOW_ONE = 0.9999
-"""Largest fading weight and largest fraction of a level in progressive mode (Octree-GS); largest adaptive threshold."""
+"""Largest fading weight of progressive mode (Octree-GS) and largest adaptive threshold."""
 LEAST_DISTANCE = 1e-8
-"""Distances are held above this fraction of the farthest: the logarithm of a camera at a primitive is finite."""
+"""Lower bound of distances whose logarithm is taken, as a fraction of the farthest."""
 MANY_LEVELS = 12
 NEAR_RATIO = 1e-3
-"""A nearest distance below this fraction of the farthest comes from points at cameras."""
+"""Nearest distance over the farthest below which points lie at cameras."""
 FEW_ANCHORS = 100
 MANY_ANCHORS = 5_000_000
 FLOAT_STEP = 2.0**-23
-"""Neighbouring float32 numbers differ by up to this fraction."""
+"""Largest relative distance of neighbouring float32 numbers."""
 
 
 def all_levels_from(options: LevelOptions, schedule: Schedule) -> int:
-    """Returns the step at which all levels take part: before the last one, however short the run; 0: from the start."""
+    """Returns the step at which all levels are in training, at most the last but one; 0: from the start."""
     return min(schedule.step(options.coarse_until), schedule.iterations - 1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Viewpoints:
-    """Places of the training cameras, and how coarsely each samples."""
+    """Positions and sampling coarseness of the training cameras."""
 
     centres: Float[Tensor, "V 3"]
     """World, float64."""
     coarseness: Float[Tensor, "V"]
-    """s: largest focal length over this camera's; a camera of half the focal length acts as if twice as far."""
+    """s: largest focal length over this camera's; half the focal length acts as twice the distance."""
     focal: float
     """The largest focal length, px."""
 
 
 def viewpoints_of(cameras: Sequence[Camera]) -> Viewpoints:
-    """Returns places and coarseness of the training cameras."""
+    """Returns positions and coarseness of the training cameras."""
     focal = max(camera.fx for camera in cameras)
     return Viewpoints(
         centres=torch.stack([camera.centre.double() for camera in cameras]),
@@ -61,25 +61,25 @@ def viewpoints_of(cameras: Sequence[Camera]) -> Viewpoints:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Levels:
-    """The levels of a scene, as numbers derived from it once."""
+    """Parameters of a scene's levels."""
 
     count: int
     """K."""
     fork: int
     nearest: float
-    """Distance between cameras and points, low quantile; scene units, of the finest camera (Octree-GS, set_level)."""
+    """Low quantile of distances between cameras and points, scene units of the finest camera (Octree-GS, set_level)."""
     farthest: float
-    """D: at this distance, seen by the finest camera, only level 0 is drawn."""
+    """D: distance at which the finest camera draws only level 0."""
     origin: float
     """Each coordinate of node (0, 0, 0) of every grid."""
     extent: float
-    """Length of the box around the points, scene units; 0 where all their coordinates are one number."""
+    """Edge of the box around the points, scene units; 0 if all coordinates are equal."""
     base_layer: int
     """Forks from the box to a cell of level 0."""
     first: int
     """Highest level in training at the start."""
     switches: tuple[int, ...]
-    """Steps after which one more level takes part each (Octree-GS, set_coarse_interval)."""
+    """Steps after which one more level is in training (Octree-GS, set_coarse_interval)."""
     threshold: float
     """Least fraction of cameras that must draw a primitive; see `LevelOptions.visible_threshold`."""
     mode: str
@@ -89,18 +89,17 @@ class Levels:
 
     @property
     def box(self) -> float:
-        """Length that is divided into cells, scene units: the extent, or D where that is 0."""
+        """Return the length that cells divide, scene units: the extent, or D if that is 0."""
         return self.extent or self.farthest
 
     @property
     def cell(self) -> float:
-        """Cell length v of level 0, scene units (Octree-GS, octree_sample)."""
+        """Return the cell length v of level 0, scene units (Octree-GS, octree_sample)."""
         return self.size(0)
 
     @property
     def pixels_per_cell(self) -> float:
-        """Cell length of level 0 at the farthest, px of the finest training camera; where finer levels are drawn first
-        their cells are as many, or (by mode) down to 1 / fork of that."""
+        """Return the cell length of level 0 at distance D, px of the finest training camera."""
         return self.cell * self.views.focal / self.farthest
 
     def size(self, level: int) -> float:
@@ -112,7 +111,7 @@ class Levels:
         return self.cell / float(self.fork) ** levels.float()
 
     def cells(self, positions: Float[Tensor, "M 3"], level: int) -> Int[Tensor, "M 3"]:
-        """Returns the nearest node of a level's grid, halves to even."""
+        """Returns the nearest nodes of a level's grid, halves to even."""
         return ((positions.double() - self.origin) / self.size(level)).round().long()
 
     def nodes(self, cells: Int[Tensor, "M 3"], level: int) -> Float[Tensor, "M 3"]:
@@ -120,25 +119,22 @@ class Levels:
         return (cells.double() * self.size(level) + self.origin).float()
 
     def highest(self, step: int) -> int:
-        """Returns the highest level that takes part at a step (Octree-GS, set_coarse_interval)."""
+        """Returns the highest level in training at a step (Octree-GS, set_coarse_interval)."""
         return min(self.count - 1, unlocked(self.switches, self.first, step))
 
     def coarseness(self, camera: Camera) -> float:
-        """Returns the finest training focal length over this camera's; at least 1 where levels end with training."""
+        """Returns the largest training focal length over this camera's; at least 1 if zoom is training."""
         ratio = self.views.focal / camera.fx
         return max(1.0, ratio) if self.zoom == "training" else ratio
 
     def ideal(self, distances: Float[Tensor, "M"], coarseness: float) -> Float[Tensor, "M"]:
-        """Returns L* = log_f(D / (s d)), finite everywhere (Octree-GS, set_anchor_mask)."""
+        """Returns L* = log_f(D / (s d)), always finite (Octree-GS, set_anchor_mask)."""
         nearness = self.farthest / (coarseness * distances).clamp_min(LEAST_DISTANCE * self.farthest)
         return nearness.log2() / math.log2(self.fork)
 
 
 def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: LevelOptions, until: int) -> Levels:
-    """Derives the levels of a scene from its points and training cameras (Octree-GS).
-
-    `until`: step of this run at which all levels take part, `options.coarse_until` rescaled; 0: from the start.
-    """
+    """Derives a scene's levels (Octree-GS); `until`: step at which all are in training, 0: from the start."""
     points, views = points.unique(dim=0), viewpoints_of(cameras)
     near, far = distance_range(points, views, options.distance_quantile)
     count = level_count(near, far, options.fork) if options.count == -1 else options.count
@@ -165,7 +161,7 @@ def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: Lev
 
 
 def distance_range(points: Float[Tensor, "P 3"], views: Viewpoints, fraction: float) -> tuple[float, float]:
-    """Returns (near, far) distances between cameras and points, in units of the finest one (Octree-GS, set_level)."""
+    """Returns (near, far) distances between cameras and points, scaled to the finest camera (Octree-GS, set_level)."""
     listed = []
     for centre, coarseness in zip(views.centres, views.coarseness.tolist(), strict=True):
         distances = offsets_from(points, centre).norm(dim=1)
@@ -175,7 +171,7 @@ def distance_range(points: Float[Tensor, "P 3"], views: Viewpoints, fraction: fl
 
 
 def level_count(near: float, far: float, fork: int) -> int:
-    """Returns as many levels as the range of distances has forks (Octree-GS, set_level); 1 if all are 0."""
+    """Returns the number of levels: forks in the range of distances, plus 1 (Octree-GS, set_level)."""
     if far == 0:
         return 1
     return round(math.log(far / max(near, LEAST_DISTANCE * far), fork)) + 1
@@ -189,16 +185,16 @@ def box_of(points: Float[Tensor, "P 3"], extend: float, rule: str) -> tuple[floa
 
 
 def first_level(count: int, first: int, until: int) -> int:
-    """Returns the highest level at the start: -1 for half of them (Octree-GS, set_level); all if none waits."""
+    """Returns the highest level at the start; -1: half of them (Octree-GS, set_level); the last if `until` is 0."""
     if until < 1:
         return count - 1
     return min(count // 2 if first == -1 else first, count - 1)
 
 
 def base_layer(box: float, count: int, options: LevelOptions, pixels: float) -> int:
-    """Returns forks from the box to a cell of level 0: given, or such that level K/2 - 1 has cells of `voxel`.
+    """Returns forks from the box to a cell of level 0; -1: level K/2 - 1 has cells of `voxel` (Octree-GS).
 
-    No more than leave a cell `cell_pixels`; `pixels`: of a unit of length at the farthest. Source: Octree-GS.
+    Cells keep at least `cell_pixels`; `pixels`: those of a unit of length at the farthest distance.
     """
     chosen = options.base_layer
     if chosen < 0:
@@ -209,7 +205,7 @@ def base_layer(box: float, count: int, options: LevelOptions, pixels: float) -> 
 
 
 def mean_drawn_fraction(points: Float[Tensor, "P 3"], levels: Levels) -> float:
-    """Returns the adaptive threshold: mean fraction of cameras that draw a node (Octree-GS), held below 1."""
+    """Returns the adaptive threshold: the mean fraction of cameras that draw a node, below 1 (Octree-GS)."""
     positions, of, _ = all_nodes(points, levels)
     return min(float(drawn_fraction(levels, positions, of).double().mean()), BELOW_ONE)
 
@@ -217,7 +213,7 @@ def mean_drawn_fraction(points: Float[Tensor, "P 3"], levels: Levels) -> float:
 def all_nodes(
     points: Float[Tensor, "P 3"], levels: Levels
 ) -> tuple[Float[Tensor, "C 3"], Int[Tensor, "C"], Int[Tensor, "K P"]]:
-    """Returns (positions, level, group) of the nodes nearest to the points, level by level (Octree-GS)."""
+    """Returns (positions, levels, group) of the nodes nearest to the points on each level (Octree-GS)."""
     positions, of, group, total = [], [], [], 0
     for level in range(levels.count):
         cells, place = new_cells(levels.cells(points, level), torch.empty(0, 3, dtype=torch.long, device=points.device))
@@ -231,10 +227,9 @@ def all_nodes(
 def initial_nodes(
     points: Float[Tensor, "P 3"], levels: Levels
 ) -> tuple[Float[Tensor, "N 3"], Int[Tensor, "N"], Int[Tensor, "K P"]]:
-    """Returns (positions, level, group) of the nodes a scene starts from: those enough cameras draw (Octree-GS).
+    """Returns (positions, levels as int16, group) of the initial nodes: those that enough cameras draw (Octree-GS).
 
-    Level is int16. `group[L, p]` is the row of the node of point p on level L, -1 if it was left out, so that
-    `pooled_max(colours.repeat(K, 1), group.flatten(), N)` are the largest colours in each cell.
+    `group[L, p]` is the row of the node of point p on level L; -1: it was left out.
     """
     positions, of, group = all_nodes(points, levels)
     chosen = kept(levels, positions, of)
@@ -252,7 +247,7 @@ def whole_level(ideal: Float[Tensor, "M"], mode: str, highest: int) -> tuple[Int
 
 
 def drawn_fraction(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) -> Float[Tensor, "M"]:
-    """Returns the share of training cameras that would draw each primitive, by distance (Octree-GS, weed_out)."""
+    """Returns the share of training cameras that draw each primitive (Octree-GS, weed_out)."""
     views, counts = levels.views, torch.zeros_like(positions[:, 0])
     for centre, coarseness in zip(views.centres, views.coarseness.tolist(), strict=True):
         ideal = levels.ideal(offsets_from(positions, centre).norm(dim=1), coarseness)
@@ -261,7 +256,7 @@ def drawn_fraction(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tens
 
 
 def kept(levels: Levels, positions: Float[Tensor, "M 3"], of: Int[Tensor, "M"]) -> Bool[Tensor, "M"]:
-    """Marks primitives that enough training cameras draw (Octree-GS, weed_out); none without a finite place."""
+    """Marks primitives at finite positions that enough training cameras draw (Octree-GS, weed_out)."""
     placed = torch.isfinite(positions).all(1)
     places = torch.where(placed[:, None], positions, 0.0)
     return (drawn_fraction(levels, places, of) > levels.threshold) & placed
@@ -275,37 +270,37 @@ def drawn(
     camera: Camera,
     highest: int,
 ) -> tuple[Bool[Tensor, "N"], Float[Tensor, "N"]]:
-    """Returns (mask, weight): primitives whose level the camera draws, and factors of their opacities (Octree-GS).
+    """Returns (primitives whose level the camera draws, factors of their opacities), without gradient (Octree-GS).
 
-    `bias` is added to each primitive's level; `highest`: finest level in use, K - 1 outside training. No gradients.
+    `bias` is added to each primitive's ideal level; `highest`: finest level in use, K - 1 outside training.
     """
     shift = levels.cell_of(of)[:, None] / 2 if levels.half_cell else 0.0
     distances = (offsets_from(positions.detach(), camera.centre) + shift).norm(dim=1)
     ideal = levels.ideal(distances, levels.coarseness(camera))
-    known = torch.isfinite(distances)  # the others are handed on: the render counts what it cannot draw
+    known = torch.isfinite(distances)  # the render counts the others
     top, weight = whole_level(torch.where(known, ideal + bias.detach(), 0.0), levels.mode, highest)
     return (of <= top) | ~known, torch.where((of == top) & known, weight, 1.0)
 
 
 def switch_points(count: int, first: int, until: int, factor: float) -> tuple[int, ...]:
-    """Returns steps at which the levels above `first` join, each interval shorter than the last (Octree-GS)."""
+    """Returns the steps at which levels above `first` join, at shrinking intervals (Octree-GS)."""
     intervals = count - 1 - first
     lengths = [factor**-n for n in range(intervals)]
     return tuple(int(until * sum(lengths[: n + 1]) / sum(lengths) + 0.5) for n in range(intervals))
 
 
 def unlocked(switches: Sequence[int], first: int, step: int) -> int:
-    """Returns the highest level at a step: `first`, and one more after each switch point (Octree-GS)."""
+    """Returns the highest level at a step: `first` plus one after each switch point (Octree-GS)."""
     return first + sum(switch < step for switch in switches)
 
 
 def thresholds(base: float, fork: int, update_ratio: float, count: int) -> tuple[float, ...]:
-    """Returns gradients at which a primitive of each level grows: tau_L = base f^(update_ratio L) (Octree-GS)."""
+    """Returns the gradient thresholds of the levels, tau_L = base f^(update_ratio L) (Octree-GS)."""
     return tuple(base * fork ** (update_ratio * level) for level in range(count))
 
 
 def facts_of(levels: Levels, of: Int[Tensor, "N"]) -> dict[str, Any]:
-    """Returns the numbers of the levels, lengths in scene units, with the primitives of each."""
+    """Returns the parameters of the levels, lengths in scene units, and the primitives on each."""
     return {
         "levels": levels.count,
         "nearest": levels.nearest,
@@ -323,7 +318,7 @@ def facts_of(levels: Levels, of: Int[Tensor, "N"]) -> dict[str, Any]:
 
 
 def note_of(levels: Levels) -> str:
-    """Returns a file's comment: what a viewer must know to choose levels at a distance (Octree-GS, save_ply)."""
+    """Returns a file comment with what a viewer needs to choose levels (Octree-GS, save_ply)."""
     return (
         f"levels {levels.count}, fork {levels.fork}, standard_dist {levels.farthest!r} at a focal length of "
         f"{levels.views.focal!r} px, init_pos {levels.origin!r}, voxel_size {levels.cell!r}"
@@ -331,7 +326,7 @@ def note_of(levels: Levels) -> str:
 
 
 def warnings_of(levels: Levels, anchors: int) -> list[str]:
-    """Returns warnings about the levels of a scene that starts with so many primitives, with the numbers."""
+    """Returns warnings about the levels of a scene with this many initial primitives."""
     finest, near, far = levels.size(levels.count - 1), levels.nearest, levels.farthest
     step = FLOAT_STEP * max(abs(levels.origin), abs(levels.origin + levels.box))
     warnings = {

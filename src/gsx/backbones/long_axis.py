@@ -1,4 +1,4 @@
-"""Splits along the longest axis: two halves side by side in the place of one Gaussian (Improved-GS)."""
+"""Splits along the longest axis: two adjacent halves replace one Gaussian (Improved-GS)."""
 
 import math
 from typing import Any
@@ -19,14 +19,14 @@ from gsx.core.training.importance import Probe, random_views
 from gsx.core.training.parameter_table import ParameterTable, detached_rows
 
 STEP, LENGTH, OPACITY = 1.35, 0.55, 0.6
-"""Of the halves: distance from the whole's centre and length, times its largest scale; share of its opacity."""
+"""Offset and length of a half over the whole's largest scale; opacity over the whole's."""
 ACROSS = math.sqrt(1 - 0.45**2)
-"""Of the halves, along the other axes."""
+"""Scale of a half along the other axes over the whole's."""
 LARGEST_OPACITY = 1 - 1e-6
 
 
 def halves(rows: dict[str, Tensor]) -> list[dict[str, Tensor]]:
-    """Returns two halves of each Gaussian, on either side of its centre along its longest axis (Improved-GS)."""
+    """Returns two halves of each Gaussian, on both sides of its centre along the longest axis (Improved-GS)."""
     longest = rows["log_scales"].argmax(1, keepdim=True)
     along = torch.zeros_like(rows["log_scales"]).scatter_(1, longest, 1.0)
     size = rows["log_scales"].gather(1, longest).exp()
@@ -39,10 +39,7 @@ def halves(rows: dict[str, Tensor]) -> list[dict[str, Tensor]]:
 
 
 def wholes(first: dict[str, Tensor], second: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Returns one Gaussian for each two: of fresh halves what they were made from.
-
-    Means of both, and covariances of both with what their distance adds, less what a split adds.
-    """
+    """Merges pairs of halves: the inverse of `halves` for fresh ones, by their first and second moments."""
     whole = {name: (value + second[name]) / 2 for name, value in first.items() if value.is_floating_point()}
     apart = (first["means"] - second["means"])[:, :, None].double() / 2
     covariance = (covariances(first) + covariances(second)).double() / 2 + apart @ apart.mT
@@ -58,13 +55,13 @@ def wholes(first: dict[str, Tensor], second: dict[str, Tensor]) -> dict[str, Ten
 
 
 def split_along(table: ParameterTable, chosen: Bool[Tensor, "N"]) -> None:
-    """Changes rows to survivors, first halves, second halves of the chosen ones."""
+    """Replaces the chosen rows by their first halves and then their second halves."""
     twins = halves({name: value[chosen] for name, value in detached_rows(table).items()})
     replace_rows(table, chosen, {name: torch.cat([twin[name] for twin in twins]) for name in twins[0]})
 
 
 def twins_of(born: Float[Tensor, "N"]) -> tuple[Int[Tensor, "P"], Int[Tensor, "P"]]:
-    """Returns (rows of first halves, of second ones) of the pairs of which both are left, by their numbers."""
+    """Returns (rows of first halves, rows of second halves) of the complete pairs, by their numbers."""
     order = born.argsort(stable=True)
     number = born[order]
     paired = ((number[:-1] == number[1:]) & (number[1:] > 0)).nonzero()[:, 0]
@@ -72,14 +69,14 @@ def twins_of(born: Float[Tensor, "N"]) -> tuple[Int[Tensor, "P"], Int[Tensor, "P
 
 
 class LongAxis(DensityControl):
-    """The Gaussians that draw most of the error, and whose pixels pull at them the most, become two halves each."""
+    """Density control that splits the Gaussians with the largest error times mean absolute gradient."""
 
     def __init__(self, options: GS3DOptions, context: BackboneContext) -> None:
         super().__init__(options, context)
         self.views = options.looks
 
     def add(self, model: Backbone[Any], step: int) -> dict[str, float]:
-        """Splits as many as there is room for."""
+        """Splits as many Gaussians as there is room for."""
         table, context = model.table, self.context
         views = random_views(context.views.at(step), self.views, self.generator)
         probe = Probe(model=model, views=context.views, step=step)
@@ -96,7 +93,7 @@ class LongAxis(DensityControl):
         return {"split": count}
 
     def before_last_event(self, table: ParameterTable) -> ParameterTable | None:
-        """Returns a table with the whole in the place of each two halves of the last event; None: there are none."""
+        """Returns the table with the halves of the last event merged; None: there are none."""
         first, second = twins_of(table.statistics["born"])
         if len(first) == 0:
             return None

@@ -1,8 +1,8 @@
-"""Merges two Gaussians into one that keeps their moments, and measures by how much their field changes.
+"""Moment-preserving merges of two Gaussians, and the change of their field.
 
-A Gaussian weighs as much as its opacity times its surface: what a viewer sees of it, not its volume (splat-transform,
-`--decimate-uniform`; NanoGS weighs volumes). The merged one has the means, covariances and colours of both by weight,
-with what the distance of the means adds to the covariance, and the opacity that keeps the weight.
+The weight of a Gaussian is its opacity times its surface, as visible area counts (splat-transform,
+`--decimate-uniform`; NanoGS uses volumes). The merged one has the weighted mean of positions, colours and covariances,
+plus the covariance of the two means, and the opacity that keeps the weight.
 """
 
 import math
@@ -17,14 +17,14 @@ from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
 from gsx.core.shapes import Float, Int
 
 Rows = Mapping[str, Tensor]
-"""Raw parameters of Gaussians by name, and whatever else belongs to them."""
+"""Raw parameters of Gaussians, and other values per row, by name."""
 PARAMETERS = ("means", "log_scales", "quats", "opacity_logits")
-"""That rows have to have for merging."""
+"""Parameters that a merge needs."""
 POWER = 1.6075
-"""Of Thomsen's formula for the surface of an ellipsoid, which is off by at most 1.1 %."""
+"""Exponent of Thomsen's formula for the surface of an ellipsoid (error up to 1.1 %)."""
 LEAST_VARIANCE = 1e-30
 LEAST_RATIO = 1e-9
-"""Of the variance across a flat Gaussian to all of it, in integrals over space."""
+"""Least variance of a flat Gaussian over its trace, in integrals over space."""
 LARGEST_OPACITY = 1 - 1e-4
 
 
@@ -53,7 +53,7 @@ def weights_of(rows: Rows) -> Float[Tensor, "N"]:
 
 
 def merged(rows: Rows, first: Int[Tensor, "P"], second: Int[Tensor, "P"]) -> dict[str, Tensor]:
-    """Returns one row for each pair of rows: numbers in the weighted mean, whole numbers of the first."""
+    """Merges pairs of rows: weighted means of floats; integers come from the first."""
     weights = weights_of(rows)
     total = weights[first] + weights[second]
     share = weights[first] / total.clamp_min(torch.finfo(total.dtype).tiny)
@@ -85,12 +85,12 @@ class Densities:
     amplitudes: Float[Tensor, "N C"]
 
     def at(self, index: Int[Tensor, "P"]) -> "Densities":
-        """Returns some of them."""
+        """Returns the densities of some rows."""
         return Densities(**{name: value[index] for name, value in vars(self).items()})
 
 
 def densities(rows: Rows, colours: Float[Tensor, "N 3"]) -> Densities:
-    """Returns densities of Gaussians with these colours, and one of 1: the dark covers, too."""
+    """Returns densities of Gaussians with these colours and a channel of 1, because dark ones cover too."""
     opacities = rows["opacity_logits"].double().sigmoid()[:, None]
     channels = torch.cat([colours.double(), torch.ones_like(opacities)], 1)
     double = {name: rows[name].double() for name in PARAMETERS}
@@ -101,9 +101,9 @@ def densities(rows: Rows, colours: Float[Tensor, "N 3"]) -> Densities:
 
 
 def products(a: Densities, b: Densities) -> Float[Tensor, "P"]:
-    """Integrates one density times the other over space, summed over colours.
+    """Integrates products of densities over space, summed over channels.
 
-    (2 pi)^1.5 |A|^.5 |B|^.5 |A + B|^-.5 exp(-d^T (A + B)^-1 d / 2), d the distance of the means.
+    (2 pi)^1.5 |A|^.5 |B|^.5 |A + B|^-.5 exp(-d^T (A + B)^-1 d / 2), d the difference of the means.
     """
     both, apart = a.covariances + b.covariances, (a.means - b.means)[:, :, None]
     exponent = (apart.mT @ torch.linalg.solve(both, apart))[:, 0, 0]
@@ -112,7 +112,7 @@ def products(a: Densities, b: Densities) -> Float[Tensor, "P"]:
 
 
 def changes(a: Densities, b: Densities, whole: Densities) -> Float[Tensor, "P"]:
-    """Returns the integral of the squared difference of a + b and `whole` over that of (a + b)^2."""
+    """Returns the integral of (a + b - whole)^2 over that of (a + b)^2."""
     before = products(a, a) + products(b, b) + 2 * products(a, b)
     difference = before + products(whole, whole) - 2 * products(a, whole) - 2 * products(b, whole)
     return difference.clamp_min(0) / before.clamp_min(torch.finfo(before.dtype).tiny)

@@ -1,6 +1,6 @@
-"""Filters for any backbone: those of Mip-Splatting (Yu et al. 2024), and rules for zoomed cameras alone.
+"""Filters for any backbone: those of Mip-Splatting (Yu et al. 2024), and rules for zoomed cameras.
 
-The 3D filter widens each Gaussian by what the finest training camera can resolve, at the same integrated opacity. The
+The 3D filter widens each Gaussian to the resolution of the finest training camera, at the same integrated opacity. The
 2D filter is a rule of the rasterizer: a dilation of `kernel` px^2 with compensated opacity.
 """
 
@@ -26,38 +26,36 @@ from gsx.formats.smoothing import LEAST_SHARE, logit_of_log, smoothed
 FILTERS = ("none", "mip", "magnified", "resampled")
 RATES = ("release", "paper")
 MATCHED = {"area": 1 / 12, "bicubic": 0.1, "lanczos": 0.05}
-"""Variance of the Gaussian whose frequency response is near a filter's up to three quarters of the Nyquist frequency of
-the pictures that it makes, px^2 (a box's is its own)."""
+"""Variance of the Gaussian that fits a filter's frequency response up to 3/4 of the Nyquist frequency, px^2."""
 ENOUGH_VIEWS = 9
-"""So many views of one density allow what one allows: below them noise and wrong poses take what they add."""
+"""Views of one density above which the filter narrows: fewer only average noise and pose errors."""
 LEAST_DEPTH = 1e-3
-"""Depths are held above this before anything is divided by them, scene units (Mip-Splatting, compute_3D_filter)."""
+"""Lower bound of depths in divisions, scene units (Mip-Splatting, compute_3D_filter)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MipOptions:
-    """Numbers of the filters; values in conf/backbone, with their sources."""
+    """Options of the filters; values in conf/backbone, with their sources."""
 
     variance: Annotated[float, Range(1e-6, 1000)]
-    """Of the 3D filter, px^2 at the finest camera."""
+    """Variance of the 3D filter, px^2 at the finest camera."""
     kernel: Annotated[float, Range(0, 1000)]
-    """Variance of the 2D filter, px^2 at every render resolution; 0: by the filter that reduced the photographs."""
+    """Variance of the 2D filter, px^2 at every render resolution; 0: by the filter that reduced the photos."""
     margin: Annotated[float, Range(0, 100)]
-    """Fraction of the raster beside it in which a camera still counts as seeing a point."""
+    """Border around the raster in which points count as visible, as a fraction of its sides."""
     near: Annotated[float, Range(0, 1e6)]
-    """Points nearer than this count as not visible, scene units."""
+    """Least depth of a visible point, scene units."""
     every: Interval
-    """Published steps between updates of the 3D filter after density control, every event of which updates it too."""
+    """Published steps between updates of the 3D filter after density control, whose events also update it."""
     stop: Steps
     """Published step from which the 3D filter is frozen."""
     rate: str = "release"
-    """What the finest camera is of those that see a primitive. `release`: one of the largest focal length of all, at
-    the least depth of any. `paper`: the one with the largest quotient of its own focal length and depth, which is the
-    same where all focal lengths are."""
+    """Finest camera of a primitive, release: the largest focal length of all cameras over the least depth; paper: the
+    largest quotient of one camera's focal length and depth."""
     views: Annotated[float, Range(1, 4)] = 1.0
-    """The most by which several views that sample a place alike narrow its filter."""
+    """Largest factor by which several equally fine views narrow a filter."""
     pseudo: bool = False
-    """Pseudo views narrow the filters of what they see, by as much as their pixels are trusted."""
+    """True: pseudo views narrow the filters of visible primitives, weighted by their pixel weights."""
 
     def __post_init__(self) -> None:
         if self.rate not in RATES:
@@ -65,27 +63,27 @@ class MipOptions:
 
 
 class Filter:
-    """What is done to Gaussians so that they do not alias; here nothing."""
+    """Antialiasing filter; this base class does nothing."""
 
     note = ""
-    """A splat file's comment on the 3D filter; empty: there is none."""
+    """Comment on the 3D filter in splat files; empty: none."""
 
     def rules(self, raster: RasterSettings) -> RasterSettings:
         """Returns the rasterizer's rules with the 2D filter."""
         return raster
 
     def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
-        """Brings the column `filter`, if there is one, to where the primitives are after a step."""
+        """Updates the column `filter`, if any, to the positions after a step."""
 
     def due(self, step: int) -> bool:
-        """Returns whether to do so at a step without a density event."""
+        """Returns whether to refresh at a step without a density event."""
         return False
 
     def pseudo_views_made(self, views: Sequence[PseudoView]) -> None:
-        """Receives the pseudo views that were made for the step under way."""
+        """Receives the new pseudo views of the current step."""
 
     def narrows(self, step: int) -> bool:
-        """Returns whether sizes after a step are smaller for finer views: the picture is to go on as it was."""
+        """Returns whether finer views make sizes smaller after a step, so that `absorb` is needed."""
         return False
 
     def smoothed(
@@ -101,15 +99,15 @@ class Filter:
 
 @dataclass(frozen=True, kw_only=True)
 class ZoomedRule(Filter):
-    """Gaussians as they are, dilated by what the finest training camera dilates them by, whatever camera draws them."""
+    """Dilation by that of the finest training camera for all cameras, without a 3D filter."""
 
     zoomed: str
     """`RasterSettings.zoomed`."""
     cameras: Sequence[Camera]
-    """Those of the training views."""
+    """Training cameras."""
 
     def rules(self, raster: RasterSettings) -> RasterSettings:
-        """Adds the focal length that dilation belongs to."""
+        """Returns the rules with the focal length that dilation refers to."""
         focal = max(camera.focal for camera in self.cameras)
         try:
             return replace(raster, zoomed=self.zoomed, training_focal=focal)
@@ -119,16 +117,15 @@ class ZoomedRule(Filter):
 
 @dataclass(frozen=True, kw_only=True)
 class MipFilter(Filter):
-    """Both filters of Mip-Splatting; sizes of the 3D filter are a column of the table, world units."""
+    """Both filters of Mip-Splatting; the table's column `filter` holds the sizes of the 3D filter, world units."""
 
     options: MipOptions
     context: BackboneContext
-    """With the cameras of the training views."""
     schedule: Schedule
     density_ends: int
-    """Step from which the filter has a clock of its own."""
+    """Step from which the filter is updated at its own interval."""
     new_views: list[PseudoView] = field(default_factory=list)
-    """Pseudo views made for the step under way, if they narrow the filter."""
+    """New pseudo views of the current step, if they narrow the filter."""
     note: str = "3D filter fused into scales and opacities"
 
     def rules(self, raster: RasterSettings) -> RasterSettings:
@@ -137,7 +134,7 @@ class MipFilter(Filter):
         return replace(raster, dilation=kernel, compensate=True)
 
     def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
-        """Computes sizes from where the primitives are after a step (Mip-Splatting, compute_3D_filter)."""
+        """Computes sizes at the positions after a step (Mip-Splatting, compute_3D_filter)."""
         points, options, views = means.detach(), self.options, self.context.views
         cameras = views.raster_cameras(step + 1)
         sizes = filter_sizes(points, cameras, options)
@@ -149,16 +146,16 @@ class MipFilter(Filter):
         table.columns["filter"] = sizes
 
     def due(self, step: int) -> bool:
-        """Returns true at intervals after density control until the filter freezes (Mip-Splatting), or if narrowing."""
+        """Returns true at intervals between density control and the filter's end, or if it narrows (Mip-Splatting)."""
         inside = self.density_ends < step < self.schedule.step(self.options.stop)
         return self.narrows(step) or (inside and step % self.schedule.interval(self.options.every) == 0)
 
     def narrows(self, step: int) -> bool:
-        """Returns whether renders become finer, or pseudo views that narrow the filter were made."""
+        """Returns whether renders become finer, or new pseudo views narrow the filter."""
         return self.context.views.changes_after(step) or bool(self.new_views)
 
     def pseudo_views_made(self, views: Sequence[PseudoView]) -> None:
-        """Keeps those of this step, if they narrow the filter."""
+        """Stores the pseudo views of this step, if they narrow the filter."""
         self.new_views[:] = views if self.options.pseudo else []
 
     def smoothed(
@@ -176,11 +173,7 @@ class MipFilter(Filter):
 def filter_named(
     name: str, options: MipOptions, context: BackboneContext, schedule: Schedule, density_ends: int
 ) -> Filter:
-    """Builds the filter of that name.
-
-    For the 3D filter, which bounds what can be learnt, supersampled training counts as finer cameras; not for the
-    dilation, which is a part of what is learnt.
-    """
+    """Builds the filter of that name; supersampled training makes the 3D filter finer, but not the dilation."""
     if name == "none":
         return Filter()
     if name in ("magnified", "resampled"):
@@ -189,7 +182,7 @@ def filter_named(
 
 
 def checked_filter(name: str) -> None:
-    """Raises ValueError for a name that is no filter."""
+    """Raises ValueError for an unknown filter."""
     if name not in FILTERS:
         raise ValueError(f"backbone.filter is '{name}'; choose one of {', '.join(FILTERS)}")
 
@@ -197,7 +190,7 @@ def checked_filter(name: str) -> None:
 def visible_depths(
     points: Float[Tensor, "N 3"], camera: Camera, options: MipOptions
 ) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
-    """Returns (depth z, whether the camera counts as seeing the point) (Mip-Splatting, compute_3D_filter)."""
+    """Returns (depths z, visibility of the points in the raster and its margin) (Mip-Splatting, compute_3D_filter)."""
     local = camera.to_camera(points).to(points)
     depth = local[:, 2].clamp_min(LEAST_DEPTH)
     column = local[:, 0] / depth * camera.fx + camera.cx
@@ -211,25 +204,22 @@ def visible_depths(
 def filter_sizes(points: Float[Tensor, "N 3"], cameras: Sequence[Camera], options: MipOptions) -> Float[Tensor, "N"]:
     """Returns the standard deviation of the 3D filter at each point, world units (Mip-Splatting, compute_3D_filter).
 
-    It is sqrt(variance) times the depth over the focal length of the finest camera that sees the point
-    (`MipOptions.rate`). Points that no camera sees get the largest size of the others.
-
-    Raises:
-        InputError: no camera sees any point.
+    That is sqrt(variance) times depth over focal length of the point's finest camera (`MipOptions.rate`), or the
+    largest size if no camera shows it. Raises InputError if no camera shows any point.
     """
     nearest = torch.full_like(points[:, 0], torch.inf)
     focal = max(camera.fx for camera in cameras)
     for camera in cameras:
         depth, visible = visible_depths(points, camera, options)
-        if options.rate == "paper":  # as far away as a camera of the largest focal length would be that is as fine
+        if options.rate == "paper":  # equally fine with the largest focal length
             depth = depth * (focal / camera.fx)
         nearest = torch.where(visible, nearest.minimum(depth), nearest)
     visible = torch.isfinite(nearest)
     if len(points) and not bool(visible.any()):
         raise InputError(
-            f"none of {len(points)} primitives is seen by any of {len(cameras)} training cameras, so "
-            "backbone.filter=mip knows no resolution: check that points and cameras belong together, or do without the "
-            "filters by backbone.filter=none"
+            f"none of {len(points)} primitives is visible in any of {len(cameras)} training cameras, so "
+            "backbone.filter=mip has no resolution: check that points and cameras belong together, or set "
+            "backbone.filter=none"
         )
     farthest = nearest[visible].max() if len(points) else nearest.new_zeros(())
     return torch.where(visible, nearest, farthest) / focal * options.variance**0.5
@@ -237,7 +227,7 @@ def filter_sizes(points: Float[Tensor, "N 3"], cameras: Sequence[Camera], option
 
 @torch.no_grad()
 def absorb(table: ParameterTable, before: Float[Tensor, "N"], after: Float[Tensor, "N"]) -> None:
-    """Changes stored scales and opacities so that pictures stay when the 3D filter narrows from `before` to `after`.
+    """Changes scales and opacities so that renders stay equal when the 3D filter narrows from `before` to `after`.
 
     s'^2 = s^2 + before^2 - after^2, o' = o prod_k s_k / s'_k.
     """
@@ -252,9 +242,9 @@ def absorb(table: ParameterTable, before: Float[Tensor, "N"], after: Float[Tenso
 def several_views(
     points: Float[Tensor, "N 3"], cameras: Sequence[Camera], sizes: Float[Tensor, "N"], options: MipOptions
 ) -> Float[Tensor, "N"]:
-    """Returns how many times as finely all views sample each point as the finest one alone, from 1 to `options.views`.
+    """Returns the resolution of all views at each point over that of the finest one, from 1 to `options.views`.
 
-    It is a third of the square root of their number, each counted by its density over the finest one's, squared.
+    That is sqrt(n / ENOUGH_VIEWS), where n sums the squared relative densities of the views.
     """
     views, deviation = torch.zeros_like(sizes), options.variance**0.5
     for camera in cameras:
@@ -270,21 +260,20 @@ def narrow_by_pseudo_views(
     sizes: Float[Tensor, "N"],
     options: MipOptions,
 ) -> None:
-    """Lowers the column `earned` to the smallest size that pseudo views have allowed; infinite where none has."""
-    earned = table.columns.get("earned", torch.full_like(sizes, torch.inf))
+    """Updates the smallest sizes by pseudo views, a column of the table; infinite without one."""
+    smallest = table.columns.get("earned", torch.full_like(sizes, torch.inf))
     for view in views:
-        earned = earned.minimum(pseudo_view_sizes(points, view, sizes, options))
-    table.columns["earned"] = earned
+        smallest = smallest.minimum(pseudo_view_sizes(points, view, sizes, options))
+    table.columns["earned"] = smallest
 
 
 @torch.no_grad()
 def pseudo_view_sizes(
     points: Float[Tensor, "N 3"], view: PseudoView, sizes: Float[Tensor, "N"], options: MipOptions
 ) -> Float[Tensor, "N"]:
-    """Returns the filter of what a pseudo view sees; infinite where it sees nothing.
+    """Returns filter sizes by one pseudo view; infinite for points outside it.
 
-    It is what the view's density allows where its pixels count whole, `sizes` where they do not count, and between them
-    by logarithms.
+    Pixel weights interpolate logarithmically between `sizes` (weight 0) and the view's own resolution (weight 1).
     """
     camera = view.camera
     places, depth = camera.project(points)

@@ -1,4 +1,4 @@
-"""Nearest neighbours of points, exactly: a grid for the many, direct comparison for the few it cannot settle."""
+"""Exact nearest neighbours of points: by a grid for most, by all distances for the rest."""
 
 from collections.abc import Sequence
 
@@ -12,36 +12,35 @@ LEAST_SQUARE_DISTANCE = 1e-7
 CHUNK_VALUES = 1 << 24
 """Distances held at once by direct comparison."""
 DIRECT = 2048
-"""Up to this many points are compared with all others directly."""
+"""Most points that are compared with all others directly."""
 SAMPLE = 256
 """Points whose neighbours set the first cell size."""
 BATCH = 20_000
-"""Points looked up in the grid at once."""
+"""Points searched in the grid at once."""
 STRIDES = (1 << 42, 1 << 21, 1)
-"""Cell numbers of neighbouring cells differ; those of far cells may collide, which only adds candidates."""
+"""Strides of cell numbers; numbers of distant cells may collide, which only adds candidates."""
+Nearest = tuple[Float[Tensor, "R count"], Int[Tensor, "R count"]]
+"""(Squared distances of rows to their nearest other points, ascending; indices of these)."""
 
 
 def mean_square_distance(points: Float[Tensor, "P 3"], neighbours: int = 3) -> Float[Tensor, "P"]:
-    """Returns the mean squared distance to the nearest other points, exact search (3D-GS, simple-knn).
-
-    With fewer than `neighbours` other points it is the mean over those there are; a single point gives 0, none nothing.
-    """
+    """Returns the mean squared distance to the nearest other points, at most `neighbours`; 0 for a single point."""
     count = max(0, min(neighbours, len(points) - 1))
     return nearest(points, count)[0].mean(1) if count else torch.zeros_like(points[:, 0])
 
 
-def nearest(points: Float[Tensor, "P 3"], count: int) -> tuple[Float[Tensor, "P count"], Int[Tensor, "P count"]]:
-    """Returns (squared distances to the nearest other points, ascending; their indices); `count` is 1..P - 1."""
+def nearest(points: Float[Tensor, "P 3"], count: int) -> Nearest:
+    """Searches the nearest other points of all points; `count` is 1..P - 1."""
     squares = points.new_empty(len(points), count)
     which = torch.empty(len(points), count, dtype=torch.long, device=points.device)
     pending = torch.arange(len(points), device=points.device)
     cell = 0.0
-    if len(points) > DIRECT:  # a length that settles the densest: the lowest decile of a sample's distances
+    if len(points) > DIRECT:  # the lowest decile of a sample's distances settles the densest points
         sample = torch.linspace(0, len(points) - 1, SAMPLE, device=points.device).long()
         cell = float(directly(points, sample, count)[0][:, -1].quantile(0.1).sqrt()) or 1.0
     while len(pending) > DIRECT:
         found, others = joined([in_cells(points, rows, cell, count) for rows in pending.split(BATCH)])
-        settled = found[:, -1] <= cell**2  # whatever lies within one cell's length was among the candidates
+        settled = found[:, -1] <= cell**2  # candidates cover one cell's length
         squares[pending[settled]], which[pending[settled]] = found[settled], others[settled]
         pending, cell = pending[~settled], 2 * cell
     if len(pending):
@@ -49,18 +48,14 @@ def nearest(points: Float[Tensor, "P 3"], count: int) -> tuple[Float[Tensor, "P 
     return squares, which
 
 
-Nearest = tuple[Float[Tensor, "R count"], Int[Tensor, "R count"]]
-"""Squared distances of rows to their nearest other points, ascending, and the indices of these."""
-
-
 def joined(parts: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    """Joins the results of parts of the rows."""
+    """Concatenates the results of parts of the rows."""
     squares, which = zip(*parts, strict=True)
     return torch.cat(squares), torch.cat(which)
 
 
 def directly(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], count: int) -> Nearest:
-    """Compares rows with all points."""
+    """Searches by the distances of rows to all points."""
     parts = []
     for part in rows.split(max(1, CHUNK_VALUES // len(points))):
         distance = torch.cdist(points[part], points, compute_mode="donot_use_mm_for_euclid_dist")
@@ -71,7 +66,7 @@ def directly(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], count: int) -
 
 
 def in_cells(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], cell: float, count: int) -> Nearest:
-    """Searches points in the 27 cells around each row; inf where there are too few."""
+    """Searches in the 27 cells around each row; inf if they have too few points."""
     owner, candidate = candidates(points, rows, cell)
     square = (points[rows[owner]] - points[candidate]).square().sum(1)
     by_distance = square.argsort(stable=True)
@@ -89,7 +84,7 @@ def in_cells(points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], cell: float, 
 def candidates(
     points: Float[Tensor, "P 3"], rows: Int[Tensor, "R"], cell: float
 ) -> tuple[Int[Tensor, "C"], Int[Tensor, "C"]]:
-    """Returns (number within `rows`, other point) for all points in the 27 cells around each row."""
+    """Returns pairs (index into `rows`, other point) of all points in the 27 cells around each row."""
     strides = torch.tensor(STRIDES, device=points.device)
     numbers = ((points.double() / cell).floor().long() * strides).sum(1)
     sorted_numbers, order = numbers.sort(stable=True)

@@ -1,4 +1,4 @@
-"""Octree-GS on explicit Gaussians in both forms: on anchors, as reported, and free with clone and split."""
+"""Octree-GS on explicit Gaussians: on anchors, as reported, or free with clone and split."""
 
 from dataclasses import dataclass, fields
 
@@ -13,12 +13,12 @@ from gsx.core.training.backbone import BackboneContext
 
 FORMS = ("anchors", "clone_split")
 QUIRKS = ("gate", "bias")
-"""Quirks of the reference that the second form has, too."""
+"""Quirks of the reference that apply to clone_split."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CloneSplitOptions:
-    """Options of the second form; all others it shares with the first."""
+    """Options of clone_split only."""
 
     rates: Rates
     density: Density
@@ -26,17 +26,15 @@ class CloneSplitOptions:
 
     def __post_init__(self) -> None:
         if self.density.absolute:
-            raise ValueError(
-                "backbone.clone_split.density.absolute is true, which density control across levels does not know"
-            )
+            raise ValueError("backbone.clone_split.density.absolute is true: set it to false, levels do not support it")
 
 
 @dataclass(frozen=True, kw_only=True)
 class OctreeGS3DOptions(ExplicitOptions):
-    """Options of both forms; values in conf/backbone/octree_gs3d.yaml. Defaults: runs older than the second form."""
+    """Options of both forms; values in conf/backbone/octree_gs3d.yaml; defaults for runs older than clone_split."""
 
     densification: str = "anchors"
-    """anchors: new ones on grid nodes (Octree-AnyGS); clone_split: of Gaussians anywhere (GSOctree)."""
+    """anchors: on grid nodes (Octree-AnyGS); clone_split: free Gaussians (GSOctree)."""
     clone_split: CloneSplitOptions | None = None
 
     def __post_init__(self) -> None:
@@ -48,10 +46,10 @@ class OctreeGS3DOptions(ExplicitOptions):
 
 
 def free_options(options: OctreeGS3DOptions) -> tuple[GS3DOptions, LevelOptions, LevelDensityOptions]:
-    """Returns the second form's options of Gaussians, of levels, and of density control across them.
+    """Returns clone_split's options of Gaussians, levels and density control.
 
     Raises:
-        ValueError: something that it needs is missing, or a switch is set that it does not have.
+        ValueError: an option is missing, or a quirk is set that has no effect.
     """
     second = options.clone_split
     if second is None or options.levels is None:
@@ -60,8 +58,8 @@ def free_options(options: OctreeGS3DOptions) -> tuple[GS3DOptions, LevelOptions,
     idle = [name for name, value in vars(options.quirks).items() if value and name not in QUIRKS]
     if idle:
         raise ValueError(
-            f"backbone.quirks.{idle[0]} is '{getattr(options.quirks, idle[0])}', which means nothing to "
-            f"densification=clone_split: leave it '', only {' and '.join(QUIRKS)} do"
+            f"backbone.quirks.{idle[0]} is '{getattr(options.quirks, idle[0])}', which has no effect on "
+            f"densification=clone_split: leave it '', only {' and '.join(QUIRKS)} apply"
         )
     both = vars(options) | {"rates": second.rates, "density": second.density}
     gaussians = GS3DOptions(**{field.name: both[field.name] for field in fields(GS3DOptions) if field.name in both})
@@ -71,7 +69,7 @@ def free_options(options: OctreeGS3DOptions) -> tuple[GS3DOptions, LevelOptions,
 
 
 def free_gaussians(options: OctreeGS3DOptions, context: BackboneContext) -> GS3D:
-    """Builds the second form: Gaussians at several levels of detail."""
+    """Builds free Gaussians at several levels of detail."""
     gaussians, level_options, density = free_options(options)
     schedule = context.schedule(options.published_iterations)
     cameras = [view.camera for view in context.scene.train]

@@ -1,4 +1,4 @@
-"""Places drawn from Gaussians, and quantiles."""
+"""Samples of Gaussians, and quantiles."""
 
 import math
 
@@ -10,14 +10,14 @@ from gsx.core.shapes import Float
 
 
 def sampled_means(rows: dict[str, Tensor], generator: torch.Generator) -> Float[Tensor, "M 3"]:
-    """Draws one place from each Gaussian, given by raw `means`, `quats` and `log_scales`."""
+    """Draws one position from each Gaussian of raw `means`, `quats` and `log_scales`."""
     noise = torch.randn(rows["means"].shape, generator=generator).to(rows["means"])
     offset = rotation_matrices(rows["quats"]) @ (noise * rows["log_scales"].exp())[:, :, None]
     return rows["means"] + offset[:, :, 0]
 
 
 def quantile(values: Float[Tensor, "M"], fraction: float) -> float:
-    """Returns a linearly interpolated quantile of any number of values (torch.quantile refuses more than 2^24)."""
+    """Returns a linearly interpolated quantile (torch.quantile is limited to 2^24 values)."""
     place = fraction * (len(values) - 1)
     low, high = (float(values.kthvalue(rank + 1).values) for rank in (math.floor(place), math.ceil(place)))
     return low + (high - low) * (place - math.floor(place))

@@ -1,36 +1,81 @@
-"""What free Gaussians and anchors share as models of a scene."""
+"""Common base of free Gaussians and anchors."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
+from torch.nn import Parameter
 
 from gsx.backbones.capacity import Capacity
 from gsx.backbones.mip import Filter
 from gsx.backbones.sky import far_away
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
+from gsx.core.gaussians.quaternions import make_identity_where_zero
+from gsx.core.quality.losses import volume_loss
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.backbone import BackboneContext
-from gsx.core.training.parameter_table import ParameterTable
+from gsx.core.training.backbone import BackboneContext, Drawn
+from gsx.core.training.parameter_table import Networks, ParameterTable, take_adam_step
 from gsx.core.training.pseudo_views import PseudoView
 
 
-class SceneModel:
-    """A model with a capacity and a filter."""
+class SceneModel(ABC):
+    """A model with a table, a capacity and a filter."""
 
     table: ParameterTable
     context: BackboneContext
     capacity: Capacity
     filter: Filter
+    volume_weight: float
+    """Weight of the mean volume of the drawn Gaussians in the loss."""
+
+    def new_table(
+        self,
+        parameters: dict[str, Tensor],
+        columns: dict[str, Tensor],
+        statistics: dict[str, Tensor],
+        networks: Networks | None = None,
+    ) -> ParameterTable:
+        """Builds a table on the context's device."""
+        device = self.context.device
+        table = ParameterTable(
+            {name: Parameter(value.to(device)) for name, value in parameters.items()},
+            {name: value.to(device) for name, value in columns.items()},
+            statistics,
+            networks,
+            former_names={"sh_dc": "sh_constant"},
+        )
+        self.capacity.initialise(table)
+        return table
+
+    def regulariser(self, drawn: Drawn) -> Float[Tensor, ""] | None:
+        """Returns the weighted mean volume of the drawn Gaussians, 0 for none; without a weight None."""
+        return volume_loss(drawn.splats.scales, self.volume_weight) if self.volume_weight else None
+
+    @abstractmethod
+    def set_rates(self, step: int) -> None:
+        """Sets the learning rates of a step."""
+
+    def update(self, step: int) -> None:
+        """Takes one Adam step; unused SH bands have zero gradients, as in the published code (3D-GS)."""
+        parameters = self.table.parameters.values()
+        if any(parameter.grad is not None for parameter in parameters):
+            for parameter in parameters:
+                parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+        self.set_rates(step)
+        take_adam_step(self.table)
+        if "quats" in self.table.parameters:
+            make_identity_where_zero(self.table["quats"])
 
     def validation_window(self, view: View, step: int) -> Window | None:
-        """Returns the window that capacity is measured by."""
+        """Returns the view's window that is held out to measure capacity."""
         return self.capacity.validation_window(self.table, view, step)
 
     def pseudo_views_made(self, views: Sequence[PseudoView], step: int) -> None:
-        """Hands new pseudo views to the filter."""
+        """Passes new pseudo views to the filter."""
         self.filter.pseudo_views_made(views)
 
     def behind_scene(self, means: Float[Tensor, "M 3"]) -> Bool[Tensor, "M"]:
-        """Marks splats that stand where a sky does."""
+        """Marks splats as far away as a sky."""
         return far_away(means, self.context.scene)

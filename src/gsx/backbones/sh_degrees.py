@@ -1,9 +1,8 @@
-"""An SH degree for each Gaussian: as many bands of colour as its pictures need.
+"""An SH degree for each Gaussian.
 
-A Gaussian with colours of degree 3 is 59 numbers, 45 of them in three bands of which a matt surface needs none. Once,
-late in the run, the colours of every lower degree that come nearest to its own are found in training views; what these
-change by, squared and summed, is what the bands above are worth (`backbones.colour_fits`). Against it stands what
-their numbers cost, by the price of a doubling of all numbers. The degree at which both together are least is kept.
+A Gaussian of degree 3 has 59 numbers, 45 of them in three bands that a matt surface does not need. Once, late in the
+run, colours of every lower degree are fitted in training views (`backbones.colour_fits`). Each Gaussian keeps the
+degree with the least squared change of the pictures plus the price of its numbers.
 """
 
 import logging
@@ -22,13 +21,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ChosenDegrees:
-    """SH degrees of N rows, with their colours."""
+    """SH degrees of N rows and their colours."""
 
     degrees: Int[Tensor, "N"]
     coefficients: Float[Tensor, "n 3 N"]
-    """Of the degrees below the highest, less the constant ones as they are; zero above a row's own."""
+    """Coefficients of the lower degrees minus the current constant ones; 0 above a row's degree."""
     highest: int
-    """Degree that has been learnt."""
+    """Degree of the trained colours."""
 
     def to(self, device: torch.device | str) -> "ChosenDegrees":
         """Moves it to a device."""
@@ -36,7 +35,7 @@ class ChosenDegrees:
 
 
 def numbers_of(degree: int, other: int) -> Int[Tensor, "D"]:
-    """Returns how many numbers a Gaussian has with colours of each degree up to `degree`; `other`: without colours."""
+    """Returns the numbers of a Gaussian with each degree up to `degree`; `other`: those that are not colours."""
     return other + 3 * torch.arange(1, degree + 2).square()
 
 
@@ -47,10 +46,10 @@ def least_degrees(
     price: float,
     numbers: Int[Tensor, "D"],
 ) -> Int[Tensor, "N"]:
-    """Returns the degree of each Gaussian that costs least; the highest where no view shows it.
+    """Returns the degree of least cost of each Gaussian; the highest if no view shows it.
 
-    squares: squared change of a picture with colours of each degree, in the mean over the views that show the row.
-    error_share: squared error of a view over what it shows; price: dB that a doubling of all numbers has to bring.
+    squares: squared change of a picture with each degree, mean over the views that show the row.
+    error_share: squared error of a view over the rows that it shows; price: dB per doubling of all numbers.
     """
     share = (numbers / numbers[-1]).to(squares)
     cost = squares + error_exponent(price) * error_share * share[:, None]
@@ -58,13 +57,13 @@ def least_degrees(
 
 
 def kept_bands(degrees: Int[Tensor, "N"], count: int) -> Bool[Tensor, "N B"]:
-    """Marks coefficients behind the constant one, of `count`, whose band is within the degree of a row."""
+    """Marks which of `count` coefficients after the constant one are within each row's degree."""
     band = torch.arange(1, count + 1, device=degrees.device).sqrt().floor()
     return band <= degrees[:, None]
 
 
 def choose_degrees(fits: ColourFits, price: float, numbers: Int[Tensor, "D"]) -> ChosenDegrees:
-    """Chooses the degree of each row that costs least, with its colours of that degree."""
+    """Chooses the degree of least cost of each row, and its colours."""
     highest = len(numbers) - 1
     lower = [fitted(fits, degree) for degree in range(highest)]
     squares = torch.stack([squared_change(fits, one) for one in lower] + [torch.zeros_like(fits.norms)])
@@ -77,26 +76,21 @@ def choose_degrees(fits: ColourFits, price: float, numbers: Int[Tensor, "D"]) ->
 
 
 def lower_degrees(table: ParameterTable, chosen: ChosenDegrees, step: int, price: float) -> dict[str, float]:
-    """Gives rows the chosen degrees and colours; it zeroes the bands above, with their moments."""
+    """Assigns the chosen degrees and colours, and zeroes higher bands with their moments."""
     before, degrees = table["sh_degree"], chosen.degrees.to(table["sh_degree"])
     lowered = degrees < chosen.highest
-    table.columns["sh_degree"] = torch.where(lowered, degrees, before)  # higher bands may not have begun to learn
+    table.columns["sh_degree"] = torch.where(lowered, degrees, before)  # higher bands may be untrained yet
     take_coefficients(table, lowered, chosen.coefficients)
-    clear_bands(table)
+    kept = kept_bands(table["sh_degree"], table["sh_rest"].shape[1])[..., None]
+    edit(table, "sh_rest", lambda old: old * kept, lambda moment: moment * kept)
     counts = torch.bincount(table["sh_degree"].long(), minlength=chosen.highest + 1).tolist()
     listed = ", ".join(f"{count} of degree {degree}" for degree, count in enumerate(counts))
     logger.info("step %d: SH degrees at a price of %.2f dB per doubling of numbers: %s", step, price, listed)
     return {f"degree_{degree}": count for degree, count in enumerate(counts)}
 
 
-def clear_bands(table: ParameterTable) -> None:
-    """Zeroes the bands that rows do not have, and their moments."""
-    kept = kept_bands(table["sh_degree"], table["sh_rest"].shape[1])[..., None]
-    edit(table, "sh_rest", lambda old: old * kept, lambda moment: moment * kept)
-
-
 def hold_bands(table: ParameterTable) -> None:
-    """Zeroes gradients of bands that rows do not have."""
+    """Zeroes the gradients of bands above each row's degree."""
     rest = table["sh_rest"]
     if rest.grad is not None:
         rest.grad *= kept_bands(table["sh_degree"], rest.shape[1])[..., None]

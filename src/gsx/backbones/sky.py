@@ -1,9 +1,7 @@
-"""Gaussians behind all that structure from motion has found: sky, and backgrounds too far away to move.
+"""Gaussians behind the points of structure from motion: sky and distant background.
 
-A pixel is open where none of the scene's points is beside it in the picture, and none above it. Directions that open
-pixels look in become points on a sphere, as far away as to stand still for cameras that walk, in the colours that
-photos show there: an environment behind the scene. Where something near turns out to hide it, it stays hidden.
-Density control leaves these Gaussians alone.
+A pixel is open if no point of the scene projects near it or above it. The directions of open pixels become points on a
+distant sphere, without visible parallax, in the mean colour of the photos. Density control does not change them.
 """
 
 import logging
@@ -18,68 +16,68 @@ from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import ParameterTable
+from gsx.formats.turned import spread_directions
 
 logger = logging.getLogger(__name__)
 
 WHEN = ("never", "auto", "always")
 """Choices of `sky`."""
 PIXELS = 4000
-"""Pixels of a picture that are examined, in rows and columns."""
+"""Most pixels of a picture that are examined, on a regular grid."""
 FEWEST = 16
-"""Points that a picture has to show before it tells what lies behind them."""
+"""Least points in a picture with open pixels."""
 GAP = 1.5
-"""Side of the squares in which points are looked for, in mean spacings of a picture's points."""
+"""Side of the squares in which points are searched, in mean spacings of a picture's points."""
 CELLS = 8000
-"""Directions of the whole sphere: 2.3 degrees apart."""
+"""Directions on the whole sphere, 2.3 degrees apart."""
 LEAST_PIXELS = 2
-"""Pixels that have to look in a direction."""
+"""Least open pixels of a direction."""
 DISTANCE = 200.0
-"""Radius of the sphere, times the scene's extent: walking from one side of the cameras to the other moves it by half a
-degree."""
+"""Least radius of the sphere, in extents of the scene: walking across all cameras moves it by half a degree."""
 BEYOND = 2.0
-"""And at least so many times the distance within which nearly all of the scene's points lie."""
+"""Least radius over the distance that contains `NEARLY_ALL` points of the scene."""
 NEARLY_ALL = 0.99
 SKY_OPACITY = 0.98
-"""Initial opacity: nothing near has to be made up in its place."""
+"""Initial opacity: high, so that no near Gaussians grow in its place."""
 WIDEST = 1.5
-"""Largest initial size, in spacings of directions: a Gaussian with far neighbours would cover what is beside it."""
+"""Largest initial size, in spacings of directions: a larger Gaussian would cover its neighbours."""
 OPEN = 0.01
-"""`sky=auto`: share of the pixels that look past the scene, from which on something stands behind it."""
+"""Least share of open pixels for a sky, with `sky=auto`."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sky:
-    """A part of a sphere around the training cameras."""
+    """Points on a sphere around the training cameras."""
 
     points: PointCloud
-    """One for each direction that is open."""
+    """One point for each open direction."""
     spacing: float
-    """Distance of neighbouring directions, scene units."""
+    """Distance of neighbouring points, scene units."""
     share: float
-    """Share of the pixels of training views that are open."""
+    """Share of open pixels in training views."""
 
 
 NOTHING = Sky(points=PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)), spacing=1.0, share=0.0)
 
 
 def sky_behind(scene: Scene, when: str) -> Sky:
-    """Returns what stands behind a scene; with `auto` nothing where photos hardly look past it."""
+    """Returns the sky of a scene; with `auto` none if few pixels are open."""
     sky = sky_of(scene)
     behind = when == "always" or sky.share >= OPEN
-    verdict = f"{len(sky.points):,} Gaussians far away stand behind it" if behind else "nothing stands behind it"
-    logger.info("sky: %.1f %% of the pixels of training views look past the scene: %s", 100 * sky.share, verdict)
+    verdict = f"adding {len(sky.points):,} distant Gaussians" if behind else "adding none"
+    logger.info("sky: %.1f %% of the pixels of training views are open, %s", 100 * sky.share, verdict)
     return sky if behind else NOTHING
 
 
 def not_sky(table: ParameterTable) -> Bool[Tensor, "N"]:
-    """Marks rows of the scene itself: density control neither splits sky nor prunes it for its size."""
+    """Marks rows of the scene itself, which density control may change."""
     if "sky" in table.columns:
         return table["sky"] == 0
     return torch.ones(len(table), dtype=torch.bool, device=table.device)
 
 
 def far_away(positions: Float[Tensor, "N 3"], scene: Scene) -> Bool[Tensor, "N"]:
-    """Marks positions that lie where a sky does: no camera of the scene can tell how far away that is."""
+    """Marks positions as far away as a sky, without visible parallax."""
     return offsets_from(positions, centre_of(scene.train)).norm(dim=1) > DISTANCE / 2 * scene.extent
 
 
@@ -87,8 +85,8 @@ def far_away(positions: Float[Tensor, "N 3"], scene: Scene) -> Bool[Tensor, "N"]
 
 
 def sky_of(scene: Scene) -> Sky:
-    """Returns the directions that open pixels of training views look in, with the colours they show."""
-    up, cells = upwards(scene.train), directions(CELLS)
+    """Returns the directions of open pixels of training views, with their mean colours."""
+    up, cells = upwards(scene.train), spread_directions(CELLS).float()
     count, colour, total = torch.zeros(CELLS), torch.zeros(CELLS, 3), 0
     for cell, values, pixels in open_views(scene, up, cells):
         count.index_add_(0, cell, torch.ones(len(cell)))
@@ -105,7 +103,7 @@ def sky_of(scene: Scene) -> Sky:
 def open_views(
     scene: Scene, up: Float[Tensor, "3"], cells: Float[Tensor, "C 3"]
 ) -> Iterator[tuple[Int[Tensor, "P"], Float[Tensor, "P 3"], int]]:
-    """Yields for each training view (cells that its open pixels look in, their colours, number of pixels examined)."""
+    """Yields for each training view (directions of its open pixels, their colours, number of examined pixels)."""
     for view in scene.train:
         pixels = pixel_grid(view)
         chosen = pixels[open_pixels(view, pixels, scene.points, up)]
@@ -114,7 +112,7 @@ def open_views(
 
 
 def pixel_grid(view: View) -> Float[Tensor, "P 2"]:
-    """Returns centres of pixels in rows and columns, at most PIXELS in a square picture."""
+    """Returns centres of pixels on a regular grid, about PIXELS of them."""
     step = max(1, math.ceil(math.sqrt(view.camera.width * view.camera.height / PIXELS)))
     columns, rows = (torch.arange(min(step // 2, side - 1), side, step) + 0.5 for side in view.camera.size)
     return torch.cartesian_prod(columns, rows)
@@ -123,10 +121,7 @@ def pixel_grid(view: View) -> Float[Tensor, "P 2"]:
 def open_pixels(
     view: View, pixels: Float[Tensor, "P 2"], points: PointCloud, up: Float[Tensor, "3"]
 ) -> Bool[Tensor, "P"]:
-    """Marks pixels that count, show more than the background of a cut-out picture, and have no point beside or above.
-
-    None where a picture shows too few points.
-    """
+    """Marks pixels that count, are not transparent, and have no point near or above; none with too few points."""
     camera = view.camera
     places, depths = camera.project(points.positions)
     places = places[camera.shows(places, depths)]
@@ -144,9 +139,9 @@ def open_pixels(
 def none_above(
     pixels: Float[Tensor, "P 2"], points: Float[Tensor, "M 2"], up: Float[Tensor, "2"], square: float
 ) -> Bool[Tensor, "P"]:
-    """Marks pixels that are at least two squares above the highest point in their column of squares and its neighbours.
+    """Marks pixels at least two squares above the highest point in their column of squares and its neighbours.
 
-    A square's sides are `square` px long; columns go upwards in the picture.
+    Squares have sides of `square` px; columns run along `up`.
     """
     axes = torch.stack([torch.stack([-up[1], up[0]]), up])
     of_pixels, of_points = ((places @ axes.T / square).floor().long() for places in (pixels, points))
@@ -162,39 +157,31 @@ def none_above(
 
 
 def upwards(views: Sequence[View]) -> Float[Tensor, "3"]:
-    """Returns the direction in the world that is up in most pictures."""
+    """Returns the world's mean up direction of all pictures."""
     mean = -torch.stack([view.camera.rotation.float()[1] for view in views]).mean(0)
     return mean / mean.norm().clamp_min(1e-9)
 
 
 def upwards_in(view: View, up: Float[Tensor, "3"]) -> Float[Tensor, "2"]:
-    """Returns the direction in a camera's picture in which the world's `up` points."""
+    """Returns the direction of the world's `up` in a picture."""
     along = (view.camera.rotation.float() @ up)[:2]
     return along / along.norm().clamp_min(1e-9)
 
 
 def rays_of(camera: Camera, pixels: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
-    """Returns directions in the world in which pixels look, at a depth of 1."""
+    """Returns world directions of pixels, at depth 1."""
     x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
     return torch.stack([x, y, torch.ones_like(x)], 1) @ camera.rotation.float()
 
 
 def centre_of(views: Sequence[View]) -> Float[Tensor, "3"]:
-    """Returns the mean of the cameras' places, float64."""
+    """Returns the mean camera centre, float64."""
     return torch.stack([view.camera.centre.double() for view in views]).mean(0)
 
 
 def radius_of(scene: Scene) -> float:
-    """Returns the radius of a sphere around all of the scene."""
+    """Returns the radius of the sky's sphere, scene units."""
     distances = offsets_from(scene.points.positions.float(), centre_of(scene.train)).norm(dim=1)
     last = max(1, round(NEARLY_ALL * len(distances)))
     within = float(distances.kthvalue(last).values) if len(distances) else 0.0
     return max(DISTANCE * scene.extent, BEYOND * within)
-
-
-def directions(count: int) -> Float[Tensor, "C 3"]:
-    """Returns `count` unit vectors, evenly over the sphere (Fibonacci's spiral)."""
-    place = torch.arange(count, dtype=torch.float64) + 0.5
-    z, turn = 1 - 2 * place / count, math.pi * (1 + math.sqrt(5)) * place
-    flat = (1 - z.square()).sqrt()
-    return torch.stack([flat * turn.cos(), flat * turn.sin(), z], 1).float()

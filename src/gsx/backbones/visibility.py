@@ -1,4 +1,4 @@
-"""Which free Gaussians a camera draws, and how large and opaque."""
+"""Visibility of free Gaussians: those that a camera draws, their scales and opacities."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,19 +13,19 @@ from gsx.core.shapes import Float, Int
 from gsx.core.training.parameter_table import ParameterTable
 
 LARGEST_LOG_SCALE = 30.0
-"""Scales are held below e^30 world units, so that their squares stay finite in float32."""
+"""Upper bound of log-scales: squares of e^30 world units stay finite in float32."""
 LEAST_WEIGHT = 1e-37
-"""A Gaussian that has yet to fade in counts as this much of its opacity: the logarithm is finite."""
+"""Lower bound of fading weights whose logarithm is taken."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VisibleGaussians:
-    """Parameters of what a camera draws of N Gaussians."""
+    """Gaussians that a camera draws."""
 
     values: dict[str, Tensor]
     """Parameters and columns, M rows."""
     rows: Int[Tensor, "M"] | None = None
-    """Rows of the table; None: all of them."""
+    """Rows of the table; None: all."""
     weights: Float[Tensor, "M"] | None = None
     """Factors of the opacities; None: 1."""
 
@@ -38,7 +38,7 @@ def everything(table: ParameterTable) -> VisibleGaussians:
 def extents(
     table: ParameterTable, visible: VisibleGaussians, filter_: Filter
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
-    """Returns scales and log-opacities as they are drawn, after the 3D filter if there is one."""
+    """Returns scales and log-opacities for drawing, after the 3D filter."""
     scales = visible.values["log_scales"].clamp(max=LARGEST_LOG_SCALE).exp()
     log_opacities = logsigmoid(visible.values["opacity_logits"])
     if visible.weights is not None:
@@ -47,24 +47,24 @@ def extents(
 
 
 class Visibility:
-    """Which Gaussians a camera draws: here every camera draws all of them."""
+    """Visibility without levels: every camera draws all Gaussians."""
 
     by_level = False
 
     def start(self, points: PointCloud) -> tuple[PointCloud, dict[str, Tensor]]:
-        """Returns (one point for each Gaussian at the start, columns of the table)."""
+        """Returns (a point for each initial Gaussian, columns of the table)."""
         return points, {}
 
     def visible(self, table: ParameterTable, camera: Camera, step: int) -> VisibleGaussians:
-        """Returns what the camera draws."""
+        """Returns the Gaussians that the camera draws."""
         return everything(table)
 
     def columns(self, table: ParameterTable) -> dict[str, Tensor]:
-        """Returns columns of a splat file beside the standard ones; they stand where normals would be."""
+        """Returns additional columns of a splat file, in place of normals."""
         return {}
 
     def plan(self, table: ParameterTable) -> dict[str, Any]:
-        """Returns what was derived from the scene, for the log and the report."""
+        """Returns facts about the scene for log and report."""
         return {}
 
     def notes(self) -> list[str]:

@@ -134,7 +134,7 @@ def test_the_content_of_the_file_counts_for_what_is_trained(trained: Path, tmp_p
     ("words", "told"),
     [
         (["backbone=scaffold", "iterations=2"], "backbone=scaffold cannot start from a splat file"),
-        (["backbone=octree_gs3d", "backbone.densification=clone_split", "iterations=2"], "says nothing of levels"),
+        (["backbone=octree_gs3d", "backbone.densification=clone_split", "iterations=2"], "a splat file has no levels"),
         (["backbone.sh_degree=1", "iterations=2"], "degree 3, backbone.sh_degree is 1"),
     ],
 )
