@@ -120,7 +120,7 @@ def test_alpha_stands_in_for_a_missing_opacity(
     names = [*XYZ, *DC, "alpha", *SCALES, *ROTATION]
     read = read_gaussians(written(tmp_path / "a.ply", names, [{"alpha": value}], types={"alpha": kind}))
     assert float(read.opacity_logits.sigmoid()) == pytest.approx(0.2, rel=1e-6)
-    assert "a.ply: property opacity is missing, alpha is taken for it" in caplog.text
+    assert "a.ply: property opacity is missing, using alpha" in caplog.text
 
 
 def test_doubles_are_read_and_those_beyond_floats_are_left_out(tmp_path: Path) -> None:
@@ -201,7 +201,7 @@ def test_a_signalling_nan_is_left_out_without_a_warning_of_numpys(tmp_path: Path
         ),
         ([*XYZ, "level", "extra_level", "f_anchor_feat_0", *SCALES, *ROTATION], "it holds anchors of Octree-GS"),
         ([*XYZ, "trbf_center", "motion_0", *SCALES, *ROTATION], "splats that move"),
-        (["packed_position", "packed_rotation", "packed_scale", "packed_color"], "lacks packed splats"),
+        (["packed_position", "packed_rotation", "packed_scale", "packed_color"], "has no packed splats"),
         ([*XYZ, *DC[:1], "opacity", *SCALES, *ROTATION], "lacks property 'f_dc_1'"),
         ([*XYZ, *DC, *rest(44), "opacity", *SCALES, *ROTATION], "44 f_rest properties"),
         ([*XYZ, *DC, *rest(8), "f_rest_9", "opacity", *SCALES, *ROTATION], "from 0 to 8"),

@@ -254,8 +254,8 @@ def test_splats_that_name_no_rules_are_read_with_a_warning(tmp_path: Path, caplo
     primitive = builder.splats(many(2, 0))
     primitive["extensions"][PREFIX] = {}
     read(tmp_path, builder.document([[primitive]], [{"mesh": 0}]), builder.body)
-    assert "splats name no kernel, 'ellipse' is taken" in caplog.text
-    assert "splats name no colorSpace, 'srgb_rec709_display' is taken" in caplog.text
+    assert "splats have no kernel, using 'ellipse'" in caplog.text
+    assert "splats have no colorSpace, using 'srgb_rec709_display'" in caplog.text
 
 
 # -- what is refused ---------------------------------------------------------------------------------------------------

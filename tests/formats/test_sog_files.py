@@ -122,7 +122,7 @@ def test_a_model_that_is_not_drawn_is_refused_and_an_unknown_one_is_named(
         read_gaussians(zipped(tmp_path / "a.sog", files_of((meta | {"model": "2dgs"}, pictures))))
     with caplog.at_level(logging.WARNING):
         read_gaussians(zipped(tmp_path / "b.sog", files_of((meta | {"model": "new"}, pictures))))
-    assert "model 'new', which gsx does not know" in caplog.text
+    assert "the unknown model 'new'" in caplog.text
 
 
 def test_a_first_entry_of_a_code_book_that_is_null_goes_on_by_its_steps(tmp_path: Path) -> None:

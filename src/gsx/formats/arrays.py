@@ -1,4 +1,4 @@
-"""Gaussians as arrays of numpy in the units that compact files hold, and what their formats share."""
+"""Gaussians as numpy arrays in the units of compact files, and code that these formats share."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -17,9 +17,9 @@ logger = logging.getLogger(__name__)
 
 V = TypeVar("V", np.ndarray, torch.Tensor)
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""Components of a quaternion other than the first, second, third, fourth."""
+"""Components of a quaternion except the first, second, third, fourth."""
 SMALLEST_OPACITY = 1e-6
-"""Opacities read as 0 or 1 are this far from it: their logits are finite."""
+"""Least distance of opacities from 0 and 1, where logits are infinite."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -45,8 +45,10 @@ def arrays_of(gaussians: Gaussians) -> Arrays:
     """Returns the arrays of Gaussians; a zero quaternion becomes the identity.
 
     Raises:
-        InputError: a value is not finite; the message has its name and the number of rows.
+        InputError: there are none, or a value is not finite.
     """
+    if not len(gaussians.means):
+        raise InputError("no splat file is written: the model has no splats")
     raw = {name: value.detach().double().cpu().numpy() for name, value in vars(gaussians).items()}
     for name, value in raw.items():
         bad = int((~np.isfinite(value)).sum())
@@ -63,14 +65,14 @@ def arrays_of(gaussians: Gaussians) -> Arrays:
 
 
 def unit_quaternions(quats: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
-    """Returns quaternions (w, x, y, z) of length 1; one of length 0 becomes the identity."""
+    """Normalises quaternions (w, x, y, z); those of length 0 become the identity."""
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):  # infinite ones become nan
         return np.where(norms == 0, [1.0, 0.0, 0.0, 0.0], quats / np.where(norms == 0, 1, norms))
 
 
 def gaussians_from(arrays: Arrays) -> Gaussians:
-    """Returns Gaussians of arrays, float32."""
+    """Returns the Gaussians of arrays, float32."""
     inner = arrays.opacities.clip(SMALLEST_OPACITY, 1 - SMALLEST_OPACITY)
     raw = vars(arrays) | {"opacity_logits": np.log(inner / (1 - inner))}
     raw.pop("opacities")
@@ -78,21 +80,17 @@ def gaussians_from(arrays: Arrays) -> Gaussians:
 
 
 def finite_rows(values: Mapping[str, V], name: str) -> dict[str, V]:
-    """Returns the rows that are finite in all values; logs how many others a file of that name has."""
+    """Drops rows with NaN or inf, and logs their number with the file's name."""
     arrays = [np.asarray(part) for part in values.values()]
     finite = np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], 0)
     if finite.all():
         return dict(values)
-    logger.warning("%s: %d of %d splats have values that are not finite, and are left out", name, (~finite).sum(),
-                   len(finite))  # fmt: skip
+    logger.warning("%s: dropping %d of %d splats with NaN or inf", name, (~finite).sum(), len(finite))
     return {key: part[finite] for key, part in values.items()}
 
 
 def joined(parts: Sequence[Arrays]) -> Arrays:
-    """Returns the splats of several parts, with the bands of the highest degree among them; those that some lack are 0.
-
-    One part is returned as it is.
-    """
+    """Concatenates parts, with the bands of the highest degree; missing bands are 0."""
     if len(parts) == 1:
         return parts[0]
     most = max(part.sh_rest.shape[1] for part in parts)
@@ -107,7 +105,7 @@ def rounded(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 
 
 def smallest_three(quats: Float[np.ndarray, "N 4"]) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
-    """Returns (index of the largest component, the others, signed so that the largest is positive)."""
+    """Returns (index of the largest component, the others with the sign that makes the largest positive)."""
     largest = np.abs(quats).argmax(1)
     rows = np.arange(len(quats))
     signs = np.where(quats[rows, largest] < 0, -1.0, 1.0)
@@ -115,7 +113,7 @@ def smallest_three(quats: Float[np.ndarray, "N 4"]) -> tuple[Int[np.ndarray, "N"
 
 
 def from_smallest_three(largest: Int[np.ndarray, "N"], three: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4"]:
-    """Returns the unit quaternions that `smallest_three` took apart."""
+    """Returns unit quaternions: the inverse of `smallest_three`."""
     quats, rows = np.empty((len(three), 4)), np.arange(len(three))
     quats[rows[:, None], OTHERS[largest]] = three
     quats[rows, largest] = np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))

@@ -1,6 +1,6 @@
-"""Axes of splat files: which way x, y and z of the numbers in a file point.
+"""Axes of splat files: directions of x, y and z.
 
-Training worlds, and what trainers write, are RDF (COLMAP, OpenCV); SPZ specifies RUB (OpenGL, three.js).
+Training worlds and trainers' files are RDF (COLMAP, OpenCV); SPZ specifies RUB (OpenGL, three.js).
 """
 
 from dataclasses import replace
@@ -18,26 +18,21 @@ QUARTER = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dty
 
 
 def to_training_axes(gaussians: Gaussians, axes: str) -> Gaussians:
-    """Returns the same Gaussians in RDF; `axes`: one of SYSTEMS, which they are in now.
+    """Converts Gaussians from `axes`, one of SYSTEMS, to RDF; mirrors left-handed systems exactly.
 
-    Left-handed systems are mirrored, which ellipsoids and spherical harmonics follow exactly. Systems whose y is front
-    or back are those that stand 8 places before them, turned: of LFD, RFD, LBU and RBU that is what the library does,
-    and not what the letters say.
+    Systems whose y is front or back are the ones 8 places earlier, turned, as in Niantic's library; for LFD, RFD, LBU
+    and RBU this differs from their letters.
     """
     if axes == TRAINED:
         return gaussians
     place = SYSTEMS.index(axes)
-    upright = flipped(gaussians, signs_between(SYSTEMS[place % 8], TRAINED))
+    signs = [1.0 if a == b else -1.0 for a, b in zip(SYSTEMS[place % 8], TRAINED, strict=True)]
+    upright = flipped(gaussians, torch.tensor(signs))
     return upright if place < 8 else turned(upright, QUARTER)
 
 
-def signs_between(axes: str, others: str) -> Float[Tensor, "3"]:
-    """Returns the signs of x, y and z that take one system to another."""
-    return torch.tensor([1.0 if a == b else -1.0 for a, b in zip(axes, others, strict=True)])
-
-
 def flipped(gaussians: Gaussians, signs: Float[Tensor, "3"]) -> Gaussians:
-    """Returns the same Gaussians where x, y and z are multiplied by signs of 1 or -1."""
+    """Multiplies x, y and z of Gaussians by signs of 1 or -1."""
     x, y, z = signs.tolist()
     turn = [1, y * z, x * z, x * y]
     bands = [y, z, x, x * y, y * z, 1, x * z, 1, y, x * y * z, y, z, x, z, x]

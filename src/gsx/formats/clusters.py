@@ -1,4 +1,4 @@
-"""k-means, deterministic: code books of numbers and of vectors."""
+"""Deterministic k-means: code books of numbers and of vectors."""
 
 import numpy as np
 import torch
@@ -12,10 +12,7 @@ CHUNK_VALUES = 1 << 24
 
 
 def number_book(values: Float[np.ndarray, "V"], size: int) -> Float[np.ndarray, "size"]:
-    """Finds ascending numbers that lie near all values: k-means in one dimension.
-
-    It begins with quantiles, where values are many, and with even steps to the ends, where they are few.
-    """
+    """Returns an ascending code book by k-means, from quantiles (dense values) and even steps (sparse ones)."""
     ordered, half = np.sort(values), size // 2
     even = np.linspace(ordered[0], ordered[-1], size - half)
     book = np.sort(np.concatenate([np.quantile(ordered, (np.arange(half) + 0.5) / half), even]))
@@ -28,14 +25,14 @@ def number_book(values: Float[np.ndarray, "V"], size: int) -> Float[np.ndarray, 
 
 
 def nearest_number(values: Float[np.ndarray, "..."], book: Float[np.ndarray, "size"]) -> Int[np.ndarray, "..."]:
-    """Returns the index of the nearest number of an ascending book."""
+    """Returns the index of the nearest number in an ascending book."""
     return np.searchsorted((book[1:] + book[:-1]) / 2, values)
 
 
 def vector_book(
     vectors: Float[np.ndarray, "N D"], size: int
 ) -> tuple[Float[np.ndarray, "size D"], Int[np.ndarray, "N"]]:
-    """Finds (vectors that lie near all, the nearest of them for each): k-means from evenly spaced rows."""
+    """Returns (code book, row of the nearest entry of each vector) by k-means from evenly spaced rows."""
     points = torch.from_numpy(vectors.astype(np.float32))
     book = points[torch.arange(size) * len(points) // size].clone()
     labels = nearest_vector(points, book)
@@ -48,7 +45,7 @@ def vector_book(
 
 
 def nearest_vector(points: Float[torch.Tensor, "N D"], book: Float[torch.Tensor, "K D"]) -> Int[torch.Tensor, "N"]:
-    """Returns the row of the nearest vector of a book."""
+    """Returns the row of the nearest vector in a book."""
     squares = book.square().sum(1)
     rows = max(1, CHUNK_VALUES // len(book))
     return torch.cat([(squares - 2 * part @ book.T).argmin(1) for part in points.split(rows)])

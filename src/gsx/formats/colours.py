@@ -1,4 +1,4 @@
-"""Colours that PLY files keep as display RGB, under the names and in the units that programs give them."""
+"""Display RGB in PLY files, with the names and units that programs use."""
 
 from collections.abc import Mapping
 
@@ -12,11 +12,11 @@ COLOUR_NAMES = (
 )
 """Names of the three channels, the usual ones first (diffuse_: MeshLab and older scanners)."""
 OVERSHOOT = 0.5
-"""Floats may lie this far beyond [0, 1] and are still of that unit: colours of harmonics are not clipped."""
+"""Floats in [0, 1] may exceed it by this, because colours of harmonics are not clipped."""
 
 
 def colours_among(columns: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """Returns the three colour columns [N, 3], in the type and unit stored; None: there are none."""
+    """Returns the colour columns [N, 3] as stored; None: there are none."""
     for names in COLOUR_NAMES:
         if set(names) <= columns.keys():
             return np.stack([columns[name] for name in names], axis=1)
@@ -24,10 +24,9 @@ def colours_among(columns: Mapping[str, np.ndarray]) -> np.ndarray | None:
 
 
 def full_scale_of(values: np.ndarray) -> float | None:
-    """Returns the value that stands for full intensity, by type and range; None: nobody writes such colours.
+    """Returns the value of full intensity by type and range; None: unknown unit.
 
-    Bytes have 255. Whole numbers of other types have 255 up to there, 65,535 beyond it. Floats have 1 within
-    OVERSHOOT of [0, 1], 255 within [0, 255].
+    Bytes have 255, other integers 255 or 65,535, floats 1 within OVERSHOOT of [0, 1], else 255.
     """
     finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
     if values.dtype == np.uint8 or not finite.size:

@@ -1,7 +1,7 @@
-"""PlayCanvas' compressed PLY (SuperSplat): 16 bytes a splat in chunks of 256, a byte a coefficient of higher bands.
+"""Compressed PLY of PlayCanvas (SuperSplat): 16 bytes a splat in chunks of 256, a byte a coefficient of higher bands.
 
-Chunks hold the least and the greatest of their positions, scales and colours; splats are put in Morton order, so that
-chunks are small (playcanvas/splat-transform, MIT). Axes are those of training worlds.
+A chunk holds bounds of its positions, scales and colours; Morton order keeps chunks small (playcanvas/splat-transform,
+MIT). Axes are those of training worlds.
 """
 
 from collections.abc import Sequence
@@ -17,27 +17,21 @@ from gsx.formats.ply import elements_of, header_of
 CHUNK = 256
 """Splats of a chunk."""
 FAR = 20.0
-"""Times the median distance of the splats from their middle."""
+"""Distance of far splats from the middle, over the median distance."""
 BOUNDS = [f"{end}_{name}" for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
           for end in ("min", "max") for name in names]  # fmt: skip
 """Properties of a chunk."""
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 LARGEST_LOG_SCALE = 20
 LEAST_RANGE = 1e-5
-"""Values of a chunk that differ by less are taken for one."""
+"""Least range of a chunk; smaller ones count as 0."""
 MOST_REST = 45
 """Coefficients of three bands, three colours."""
 
 
 def encode_compressed_ply(arrays: Arrays, comments: Sequence[str] = ()) -> bytes:
-    """Encodes a file.
-
-    Raises:
-        InputError: there are no splats.
-    """
+    """Encodes a file of at least one splat."""
     count = len(arrays.means)
-    if count == 0:
-        raise InputError("compressed PLY holds no empty scenes: the model has no splats")
     order = chunk_order(arrays.means, arrays.opacities)
     values = [
         arrays.means[order],
@@ -72,10 +66,10 @@ def encode_compressed_ply(arrays: Arrays, comments: Sequence[str] = ()) -> bytes
 
 
 def chunk_order(means: Float[np.ndarray, "N 3"], opacities: Float[np.ndarray, "N"]) -> Int[np.ndarray, "N"]:
-    """Orders rows along a Morton curve; those FAR beyond most others, as a sky, come last, along one of their own.
+    """Orders rows along a Morton curve; FAR ones, such as a sky, come last along their own curve.
 
-    On one curve a few of them would leave all others in a single cell, and chunks as large as the whole. The chunk in
-    which both meet is filled with the faintest of the others, whose places become coarse.
+    On one curve a few far splats would put all others into one cell. The faintest near splats, whose positions become
+    coarse, fill the chunk that both share.
     """
     distance = np.abs(means - np.median(means, 0)).max(1)
     far = distance > FAR * np.median(distance)
@@ -89,7 +83,7 @@ def chunk_order(means: Float[np.ndarray, "N 3"], opacities: Float[np.ndarray, "N
 
 
 def morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
-    """Orders rows along a Morton curve of 10 bits an axis; equal ones in their order."""
+    """Orders rows along a Morton curve of 10 bits an axis, stable."""
     least, most = means.min(0), means.max(0)
     cells = bits(share(means, least, most), 10)
     spread = np.sum([(cells >> bit & 1) << 3 * bit for bit in range(10)], 0)
@@ -100,13 +94,13 @@ def morton_order(means: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
 def share(
     values: Float[np.ndarray, "N 3"], least: Float[np.ndarray, "..."], most: Float[np.ndarray, "..."]
 ) -> Float[np.ndarray, "N 3"]:
-    """Returns where values lie between the least and the most of their chunk, in [0, 1]; 0 where these are one."""
+    """Returns the relative place of values between bounds, in [0, 1]; 0 if the bounds are equal."""
     span = most.astype(float) - least
     return np.where(span < LEAST_RANGE, 0, (values - least) / np.maximum(span, LEAST_RANGE)).clip(0, 1)
 
 
 def bits(shares: Float[np.ndarray, "..."], count: int) -> Int[np.ndarray, "..."]:
-    """Converts shares in [0, 1] to whole numbers of so many bits."""
+    """Quantises shares in [0, 1] to `count` bits."""
     most = 2**count - 1
     return np.floor(shares * most + 0.5).clip(0, most).astype(np.int64)
 
@@ -118,17 +112,13 @@ def packed_11_10_11(shares: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
 
 
 def decode_compressed_ply(content: bytes) -> Arrays:
-    """Decodes a file.
-
-    Raises:
-        InputError: it is damaged, or no compressed PLY.
-    """
+    """Decodes a file; InputError: it is damaged, or no compressed PLY."""
     elements = elements_of(content)
     chunks, vertices = elements.get("chunk"), elements.get("vertex")
     if chunks is None or vertices is None or not set(PACKED) <= set(vertices.dtype.names or ()):
-        raise InputError("it lacks packed splats: export it anew as compressed PLY")
+        raise InputError("it has no packed splats: export it anew as compressed PLY")
     if not set(BOUNDS[:12]) <= set(chunks.dtype.names or ()) or len(chunks) != -(-len(vertices) // CHUNK):
-        raise InputError("its chunks are not those of its splats: export it anew as compressed PLY")
+        raise InputError("its chunks do not match its splats: export it anew as compressed PLY")
     if not all(np.isfinite(chunks[name]).all() for name in chunks.dtype.names or ()):
         raise InputError("a chunk's range is not finite: export it anew")
     chunk_of = np.arange(len(vertices)) // CHUNK
@@ -151,7 +141,7 @@ def decode_compressed_ply(content: bytes) -> Arrays:
 
 
 def ends(chunks: np.ndarray, first: int) -> tuple[Float[np.ndarray, "C 3"], Float[np.ndarray, "C 3"]]:
-    """Returns the least and the most values of chunks, of the properties from one of BOUNDS on."""
+    """Returns (least, most) values of chunks, from the six properties of BOUNDS that begin at `first`."""
     columns = np.stack([chunks[name].astype(float) for name in BOUNDS[first : first + 6]], 1)
     return columns[:, :3], columns[:, 3:]
 
@@ -162,18 +152,18 @@ def unpacked_11_10_11(
     most: Float[np.ndarray, "C 3"],
     chunk_of: Int[np.ndarray, "N"],
 ) -> Float[np.ndarray, "N 3"]:
-    """Unpacks `packed_11_10_11` into the range of each chunk."""
+    """Unpacks `packed_11_10_11` into the bounds of each chunk."""
     shares = np.stack([packed >> 21, packed >> 11 & 1023, packed & 2047], 1) / (2047, 1023, 2047)
     return least[chunk_of] + (most - least)[chunk_of] * shares
 
 
 def higher_bands(table: np.ndarray | None, count: int) -> Float[np.ndarray, "N B 3"]:
-    """Returns coefficients of higher bands; none where there is no table."""
+    """Returns coefficients of higher bands; none without a table."""
     if table is None:
         return np.zeros((count, 0, 3))
     names = [f"f_rest_{i}" for i in range(len(table.dtype.names or ()))]
     if len(names) not in (9, 24, MOST_REST) or len(table) != count or set(names) != set(table.dtype.names or ()):
-        raise InputError("its spherical harmonics are not those of its splats: export it anew")
+        raise InputError("its spherical harmonics do not match its splats: export it anew")
     stored = np.stack([table[name] for name in names], 1)
     values = np.select([stored == 0, stored == 255], [-4.0, 4.0], ((stored + 0.5) / 256 - 0.5) * 8)
     return values.reshape(count, 3, -1).transpose(0, 2, 1)

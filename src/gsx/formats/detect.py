@@ -1,4 +1,4 @@
-"""The format of a splat file by its first bytes: names of files are changed by people and by programs."""
+"""Format of a splat file by its first bytes, because file names are unreliable."""
 
 from pathlib import Path
 
@@ -6,15 +6,15 @@ from gsx.formats.ply import header_length
 from gsx.formats.suffixes import STANDARD, suffix_of
 
 MOST_HEADER = 1 << 16
-"""Bytes within which the header of a splat file ends."""
+"""Most bytes of a splat file's header."""
 FIRST_BYTES = {b"glTF": ".glb", b"PK\x03\x04": ".sog", b"\x1f\x8b\x08": ".spz", b"NGSP": ".spz"}
-"""First bytes of each format that has some of its own, but for PLY; three of gzip, as a `.splat` may begin with two."""
+"""First bytes of formats other than PLY; three of gzip, because a `.splat` may begin with two of them."""
 PACKED_PROPERTY = b" packed_position"
 """A property that only compressed PLY has."""
 
 
 def format_of(head: bytes, path: Path) -> str:
-    """Returns which of SUFFIXES a file is, by its first bytes, or by its name where these show none."""
+    """Returns the format, one of SUFFIXES, by the first bytes, else by the name."""
     if head.startswith(b"ply"):
         return ".compressed.ply" if PACKED_PROPERTY in head[: header_length(head)] else STANDARD
     named = suffix_of(path) or STANDARD

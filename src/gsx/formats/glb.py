@@ -1,14 +1,10 @@
-"""GLB with KHR_gaussian_splatting: scales and opacities are linear, colours are harmonics of sRGB or linear light.
+"""GLB with KHR_gaussian_splatting: linear scales and opacities, harmonics of sRGB or linear light.
 
-Follows the ratified extension, in the text of KhronosGroup/glTF 63770cc (2026-04-15).
-
-Splats are written as training has them (x right, y down, z front) below a node that turns them by 180 degrees about z,
-into glTF's world (y up): a viewer that applies the node turns their spherical harmonics with them.
+Follows the ratified extension, in the text of KhronosGroup/glTF 63770cc (2026-04-15). Splats are written in training
+axes below a node that turns them by 180 degrees about z into glTF's world (y up); viewers turn harmonics with it.
 """
 
-import json
 import logging
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,21 +15,7 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.sh import degree_of
 from gsx.core.shapes import Float
 from gsx.formats.arrays import Arrays, finite_rows, joined
-from gsx.formats.gltf_asset import (
-    BINARY_CHUNK,
-    FLOAT,
-    JSON_CHUNK,
-    KINDS,
-    MAGIC,
-    Asset,
-    Entry,
-    asset_of,
-    entry_at,
-    list_in,
-    part_of,
-    values_of,
-    view_of,
-)
+from gsx.formats.gltf_asset import KINDS, Asset, Entry, asset_of, entry_at, glb_of, list_in, part_of, values_of, view_of
 from gsx.formats.gltf_nodes import moved, placed_meshes
 from gsx.formats.linear_colours import srgb_of_linear
 from gsx.formats.spz import decode_spz
@@ -46,7 +28,7 @@ TURN = [0.0, 0.0, 1.0, 0.0]
 """Quaternion (x, y, z, w) of the node."""
 TRAINING_FROM_GLTF = np.diag([-1.0, -1.0, 1.0, 1.0])
 """180 degrees about z: y up becomes y down."""
-ARRAY_BUFFER, POINTS = 34962, 0
+ARRAY_BUFFER, FLOAT, POINTS = 34962, 5126, 0
 
 POSITION = "POSITION"
 ROTATION, SCALE, OPACITY = (f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))
@@ -54,28 +36,22 @@ CONSTANT = f"{EXTENSION}:SH_DEGREE_0_COEF_0"
 REQUIRED = (POSITION, ROTATION, SCALE, OPACITY, CONSTANT)
 SRGB, LINEAR = "srgb_rec709_display", "lin_rec709_display"
 RULES = {"kernel": "ellipse", "projection": "perspective"}
-"""Rules for drawing splats. The order of blending is gsx's own: by depth, not by distance."""
+"""Rules for drawing splats; gsx blends by depth, not by distance."""
 SPZ_EXTENSIONS = (
     "KHR_gaussian_splatting_compression_spz_2",
     "KHR_gaussian_splatting_compression_spz",
     "KHR_spz_gaussian_splats_compression",
 )
-"""Proposals, not ratified, that keep splats as SPZ in a buffer view (Cesium)."""
+"""Proposed extensions with splats as SPZ in a buffer view (Cesium)."""
 SMALLEST_SCALE = 1e-10
-"""Scales of 0, which have no logarithm, are read as this."""
+"""Scale in place of 0, whose logarithm is infinite."""
 OVERSHOOT = 1e-3
-"""Opacities this far beyond [0, 1] are rounding."""
+"""Rounding of opacities beyond [0, 1]."""
 
 
 def encode_glb(arrays: Arrays, comments: Sequence[str] = (), origin: Sequence[float] = (0.0, 0.0, 0.0)) -> bytes:
-    """Encodes a file. origin: added to positions, by the node.
-
-    Raises:
-        InputError: there are no splats.
-    """
-    count = len(arrays.means)
-    if count == 0:
-        raise InputError("GLB holds no empty scenes: the model has no splats")
+    """Encodes a file of at least one splat. origin: added to positions, by the node."""
+    count, (x, y, z) = len(arrays.means), origin
     columns = {name: values.astype("<f4") for name, values in attributes_of(arrays).items()}
     body, views, accessors = b"", [], []
     for values in columns.values():
@@ -87,32 +63,24 @@ def encode_glb(arrays: Arrays, comments: Sequence[str] = (), origin: Sequence[fl
     primitive = {
         "mode": POINTS,
         "attributes": {name: i for i, name in enumerate(columns)},
-        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": SRGB}},
     }
     content = {
         "asset": {"version": "2.0", "generator": "gsx", "extras": {"extension": REVISION, "comments": list(comments)}},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": TURN, **translation_by(origin)}],
+        "nodes": [{"mesh": 0, "rotation": TURN} | ({"translation": [-x, -y, z]} if any(origin) else {})],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": len(body)}],
     }
-    text = json.dumps(content, separators=(",", ":")).encode()
-    chunks = chunk(JSON_CHUNK, text, b" ") + chunk(BINARY_CHUNK, body, b"\0")
-    return struct.pack("<III", MAGIC, 2, 12 + len(chunks)) + chunks
-
-
-def translation_by(origin: Sequence[float]) -> dict[str, list[float]]:
-    """Returns what a node has that moves splats by an origin, in glTF's world; nothing without an origin."""
-    x, y, z = origin
-    return {"translation": [-x, -y, z]} if any(origin) else {}
+    return glb_of(content, body)
 
 
 def attributes_of(arrays: Arrays) -> dict[str, Float[np.ndarray, "..."]]:
-    """Returns attributes by name, in the units of the extension."""
+    """Returns the attributes in the units of the extension, by name."""
     found = {
         POSITION: arrays.means,
         ROTATION: arrays.quats[:, [1, 2, 3, 0]],
@@ -124,27 +92,20 @@ def attributes_of(arrays: Arrays) -> dict[str, Float[np.ndarray, "..."]]:
 
 
 def higher_bands(degree: int) -> list[str]:
-    """Returns the names of the attributes of all bands but the constant one."""
+    """Returns the names of the attributes of the bands after the constant one."""
     return [f"{EXTENSION}:SH_DEGREE_{band}_COEF_{n}" for band in range(1, degree + 1) for n in range(2 * band + 1)]
-
-
-def chunk(kind: int, content: bytes, padding: bytes) -> bytes:
-    """Packs a chunk of the container, of a multiple of 4 bytes."""
-    content += padding * (-len(content) % 4)
-    return struct.pack("<II", len(content), kind) + content
 
 
 # -- reading -----------------------------------------------------------------------------------------------------------
 
 
 def decode_glb(content: bytes, name: str = "", folder: Path | None = None) -> Arrays:
-    """Returns the splats of a GLB or glTF of any program, in the axes of training worlds.
+    """Returns all splats of the scene of a GLB or glTF, moved by their nodes, in training axes.
 
-    All splats of its scene are put together, each where its node is. Other primitives are left out, as are rows that
-    are not finite. name: of the file, for the log; folder: of its buffers.
+    Other primitives, and rows with NaN or inf, are dropped. name: of the file, for the log; folder: of its buffers.
 
     Raises:
-        InputError: it is damaged, holds no splats, or some that are drawn otherwise than by this extension.
+        InputError: it is damaged, has no splats, or some with other drawing rules.
     """
     asset = asset_of(content, folder)
     parts, others, dropped = [], 0, False
@@ -160,32 +121,33 @@ def decode_glb(content: bytes, name: str = "", folder: Path | None = None) -> Ar
         raise InputError(f"its scene holds no splats ({EXTENSION}), but {others} other primitives{why}. "
                          "Choose another file, or export it anew")  # fmt: skip
     if others:
-        logger.info("%s: %d primitives of its scene are no splats, and are left out", name, others)
+        logger.info("%s: skipping %d primitives of its scene that are no splats", name, others)
     arrays = joined(parts)
-    refuse_far(arrays)
+    if len(arrays.means) and not np.abs(arrays.means).max() <= np.finfo(np.float32).max:
+        raise InputError("its splats lie beyond what 32 bits hold: export them with their transform applied")
     return arrays
 
 
 def names_linear(content: bytes) -> bool:
-    """Returns whether a GLB or glTF names colours of linear light."""
+    """Returns whether a GLB or glTF has colours of linear light."""
     return f'"{LINEAR}"'.encode() in content
 
 
 def holds_splats(primitive: Any) -> bool:
-    """Returns whether a primitive is of splats."""
+    """Returns whether a primitive consists of splats."""
     if not isinstance(primitive, dict):
         raise InputError("one of its primitives is no object: export it anew")
     return EXTENSION in part_of(primitive, "extensions") or bool(compression_of(primitive))
 
 
 def splats_of_primitive(asset: Asset, primitive: Entry, name: str) -> Arrays:
-    """Returns the splats of a primitive in its own axes, their colours in sRGB."""
+    """Returns the splats of a primitive in its own axes, with sRGB colours."""
     options = part_of(part_of(primitive, "extensions"), EXTENSION)
     refuse_other_rules(options)
     compressed = compression_of(primitive)
     if compressed:
         content, _ = view_of(asset, compressed.get("bufferView"))
-        arrays, _ = decode_spz(content)  # a node turns them, not their format
+        arrays, _ = decode_spz(content)  # the node turns them
     else:
         attributes = part_of(primitive, "attributes")
         found = {key: values_of(asset, attributes[key]) for key in splat_attributes(attributes)}
@@ -193,7 +155,7 @@ def splats_of_primitive(asset: Asset, primitive: Entry, name: str) -> Arrays:
         arrays = arrays_of_attributes(finite_rows(found, name))
     for key, usual in {"kernel": RULES["kernel"], "colorSpace": SRGB}.items():
         if key not in options:
-            logger.warning("%s: splats name no %s, '%s' is taken", name, key, usual)
+            logger.warning("%s: splats have no %s, using '%s'", name, key, usual)
     space = options.get("colorSpace", SRGB)
     if space not in (SRGB, LINEAR):
         raise InputError(f"its colours are of '{str(space)[:40]}', gsx reads {SRGB} and {LINEAR}: export one of them")
@@ -201,7 +163,7 @@ def splats_of_primitive(asset: Asset, primitive: Entry, name: str) -> Arrays:
 
 
 def compression_of(primitive: Entry) -> Entry:
-    """Returns the extension that keeps a primitive's splats as SPZ; empty: there is none."""
+    """Returns the extension of a primitive with splats as SPZ; empty: none."""
     extensions = part_of(primitive, "extensions")
     inner = part_of(part_of(extensions, EXTENSION), "extensions")
     names = [key for key in extensions | inner if key in SPZ_EXTENSIONS]
@@ -209,7 +171,7 @@ def compression_of(primitive: Entry) -> Entry:
 
 
 def refuse_other_rules(options: Entry) -> None:
-    """Raises InputError if splats are drawn otherwise than as ellipses in perspective."""
+    """Raises InputError for drawing rules other than ellipses in perspective."""
     for key, known in RULES.items():
         value = options.get(key, known)
         if value != known:
@@ -220,7 +182,7 @@ def refuse_other_rules(options: Entry) -> None:
 
 
 def splat_attributes(attributes: Entry) -> list[str]:
-    """Returns the attributes that splats are read from; others, such as COLOR_0, repeat them."""
+    """Returns the names of splat attributes; others, such as COLOR_0, are redundant."""
     missing = [name for name in REQUIRED if name not in attributes]
     if missing:
         draft = ", as drafts of the extension did" if "_ROTATION" in attributes or "_SCALE" in attributes else ""
@@ -233,7 +195,7 @@ def splat_attributes(attributes: Entry) -> list[str]:
 
 
 def refuse_shapes(found: dict[str, Float[np.ndarray, "N k"]]) -> None:
-    """Raises InputError if attributes have a form that those of splats do not have."""
+    """Raises InputError for attributes of a wrong shape."""
     for key, values in found.items():
         width = {ROTATION: 4, OPACITY: 1}.get(key, 3)
         if values.shape != (len(found[POSITION]), width):
@@ -242,7 +204,7 @@ def refuse_shapes(found: dict[str, Float[np.ndarray, "N k"]]) -> None:
 
 
 def arrays_of_attributes(found: dict[str, Float[np.ndarray, "N k"]]) -> Arrays:
-    """Returns splats of finite attributes by name."""
+    """Returns the splats of finite attributes."""
     scales, opacities, quats = found[SCALE], found[OPACITY][:, 0], found[ROTATION]
     if (scales < 0).any():
         raise InputError("a scale is below 0, but scales are no logarithms in glTF: export it anew")
@@ -259,9 +221,3 @@ def arrays_of_attributes(found: dict[str, Float[np.ndarray, "N k"]]) -> Arrays:
         sh_dc=found[CONSTANT],
         sh_rest=np.stack(rest, 1) if rest else np.empty((len(scales), 0, 3)),
     )
-
-
-def refuse_far(arrays: Arrays) -> None:
-    """Raises InputError if a node moved splats beyond what 32 bits hold."""
-    if len(arrays.means) and not np.abs(arrays.means).max() <= np.finfo(np.float32).max:
-        raise InputError("its splats lie beyond what 32 bits hold: export them with their transform applied")

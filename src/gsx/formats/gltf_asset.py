@@ -1,4 +1,4 @@
-"""Documents, buffers and accessors of glTF 2.0, as GLB or as text with its buffers (glTF specification, 3.6 and 4).
+"""Documents, buffers and accessors of glTF 2.0, as GLB or as text with buffers (glTF specification, 3.6 and 4).
 
 Damaged content raises InputError, which calls the file "it".
 """
@@ -20,26 +20,25 @@ from gsx.core.shapes import Float
 
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 KINDS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-"""Values of each type of accessor that splats have."""
+"""Values per row of the accessor types of splats."""
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-FLOAT = 5126
 LARGEST = 1e30
-"""Numbers of a document are smaller."""
+"""Bound of numbers in a document."""
 DATA_URI = "data:"
 COMPRESSED_VIEWS = ("EXT_meshopt_compression", "KHR_meshopt_compression")
-"""Extensions of buffer views whose bytes are no values."""
+"""Extensions of buffer views with compressed values."""
 Entry = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Asset:
-    """A document with the bytes that it refers to."""
+    """A document with its buffers."""
 
     document: Entry
     binary: bytes
-    """The binary chunk of a GLB; empty where it has none."""
+    """Binary chunk of a GLB; may be empty."""
     folder: Path | None
-    """Folder of the buffers in files of their own; None: these are not read."""
+    """Folder of buffers in separate files; None: these are not read."""
     buffers: dict[int, bytes] = field(default_factory=dict)
     """Buffers read so far, by index."""
 
@@ -48,15 +47,19 @@ class Asset:
 
 
 def asset_of(content: bytes, folder: Path | None = None) -> Asset:
-    """Returns the asset of a GLB, or of a glTF as text.
-
-    Raises:
-        InputError: it is neither, ends early, or is of another version.
-    """
+    """Returns the asset of a GLB, or of a glTF as text; InputError: it is neither, cut short, or of another version."""
     if content.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
         return Asset(document=document_of(content), binary=b"", folder=folder)
     text, binary = chunks_of(content)
     return Asset(document=document_of(text), binary=binary, folder=folder)
+
+
+def glb_of(document: Entry, binary: bytes) -> bytes:
+    """Packs a document and a binary chunk as GLB; chunks have multiples of 4 bytes."""
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text, binary = (part + padding * (-len(part) % 4) for part, padding in ((text, b" "), (binary, b"\0")))
+    chunks = struct.pack("<II", len(text), JSON_CHUNK) + text + struct.pack("<II", len(binary), BINARY_CHUNK) + binary
+    return struct.pack("<III", MAGIC, 2, 12 + len(chunks)) + chunks
 
 
 def chunks_of(content: bytes) -> tuple[bytes, bytes]:
@@ -96,7 +99,7 @@ def document_of(text: bytes) -> Entry:
 
 
 def entry_at(document: Entry, collection: str, index: Any) -> Entry:
-    """Returns an entry of a collection of the document, such as a node."""
+    """Returns an entry of a collection, such as a node."""
     entries = list_in(document, collection)
     if type(index) is int and 0 <= index < len(entries) and isinstance(entries[index], dict):
         return dict(entries[index])
@@ -104,7 +107,7 @@ def entry_at(document: Entry, collection: str, index: Any) -> Entry:
 
 
 def part_of(entry: Entry, key: str) -> Entry:
-    """Returns an object within an entry; empty: it has none."""
+    """Returns an object in an entry, empty by default."""
     part = entry.get(key, {})
     if not isinstance(part, dict):
         raise InputError(f"its '{key}' is no object: export it anew")
@@ -112,7 +115,7 @@ def part_of(entry: Entry, key: str) -> Entry:
 
 
 def list_in(entry: Entry, key: str) -> list[Any]:
-    """Returns a list within an entry; empty: it has none."""
+    """Returns a list in an entry, empty by default."""
     values = entry.get(key, [])
     if not isinstance(values, list):
         raise InputError(f"its '{key}' is no list: export it anew")
@@ -128,7 +131,7 @@ def whole_in(entry: Entry, key: str, default: int | None = None) -> int:
 
 
 def numbers_in(entry: Entry, key: str, default: Sequence[float]) -> Float[np.ndarray, "k"]:
-    """Returns as many numbers of an entry as the default has."""
+    """Returns finite numbers of an entry, as many as in the default."""
     values = entry.get(key, default)
     counted = isinstance(values, Sequence) and len(values) == len(default)
     if counted and all(type(value) in (int, float) and abs(value) < LARGEST for value in values):
@@ -140,7 +143,7 @@ def numbers_in(entry: Entry, key: str, default: Sequence[float]) -> Float[np.nda
 
 
 def buffer_of(asset: Asset, index: int) -> bytes:
-    """Returns the bytes of a buffer: of the binary chunk, of the document, or of a file next to it."""
+    """Returns the bytes of a buffer: the binary chunk, a data URI, or a file in the same folder."""
     if index not in asset.buffers:
         entry = entry_at(asset.document, "buffers", index)
         content = asset.binary if "uri" not in entry else linked(asset, entry["uri"])
@@ -152,7 +155,7 @@ def buffer_of(asset: Asset, index: int) -> bytes:
 
 
 def linked(asset: Asset, uri: Any) -> bytes:
-    """Returns the bytes that a buffer's URI stands for."""
+    """Returns the bytes of a buffer's URI."""
     if isinstance(uri, str) and uri.startswith(DATA_URI):
         head, _, data = uri.partition(",")
         try:
@@ -162,14 +165,8 @@ def linked(asset: Asset, uri: Any) -> bytes:
         except (binascii.Error, ValueError):
             raise InputError("a buffer's data URI is damaged: export it anew") from None
     name = unquote(uri) if isinstance(uri, str) else ""
-    inside = (
-        name
-        and "\0" not in name
-        and "://" not in name
-        and not Path(name).is_absolute()
-        and ".." not in Path(name).parts
-    )
-    if asset.folder is None or not inside:
+    outside = "\0" in name or "://" in name or Path(name).is_absolute() or ".." in Path(name).parts
+    if asset.folder is None or not name or outside:
         raise InputError(f"its buffer '{str(uri)[:60]}' is no file next to it: export it as GLB")
     try:
         return (asset.folder / name).read_bytes()
@@ -178,7 +175,7 @@ def linked(asset: Asset, uri: Any) -> bytes:
 
 
 def view_of(asset: Asset, index: Any) -> tuple[bytes, Entry]:
-    """Returns the bytes of a buffer view, and its entry."""
+    """Returns (bytes of a buffer view, its entry)."""
     entry = entry_at(asset.document, "bufferViews", index)
     compressed = [name for name in COMPRESSED_VIEWS if name in part_of(entry, "extensions")]
     if compressed:
@@ -191,11 +188,7 @@ def view_of(asset: Asset, index: Any) -> tuple[bytes, Entry]:
 
 
 def values_of(asset: Asset, index: Any) -> Float[np.ndarray, "N k"]:
-    """Returns the values of an accessor: of any type, normalised where it says so, sparse ones filled in.
-
-    Raises:
-        InputError: it is damaged, or of a type that splats do not have.
-    """
+    """Returns the values of an accessor, normalised and with sparse ones; InputError: damaged, or no type of splats."""
     accessor = entry_at(asset.document, "accessors", index)
     width, count = KINDS.get(str(accessor.get("type")), 0), whole_in(accessor, "count")
     if not width or whole_in(accessor, "componentType") not in COMPONENTS or not count:
@@ -207,11 +200,11 @@ def values_of(asset: Asset, index: Any) -> Float[np.ndarray, "N k"]:
 
 
 def stored(asset: Asset, accessor: Entry, count: int, width: int) -> np.ndarray:
-    """Returns the stored values of an accessor without its sparse ones; zeros where it has no buffer view."""
+    """Returns the stored values of an accessor without sparse ones; zeros without a buffer view."""
     kind = np.dtype(COMPONENTS[accessor["componentType"]])
     if "bufferView" not in accessor:
         buffers = range(len(list_in(asset.document, "buffers")))
-        if count > sum(len(buffer_of(asset, index)) for index in buffers):  # a length that it states may be false
+        if count > sum(len(buffer_of(asset, index)) for index in buffers):  # a stated length may be false
             raise InputError(f"an accessor has {count:,} values, more than the file has bytes: export it anew")
         return np.zeros((count, width), kind)
     content, view = view_of(asset, accessor["bufferView"])
@@ -223,7 +216,7 @@ def stored(asset: Asset, accessor: Entry, count: int, width: int) -> np.ndarray:
 
 
 def fill_sparse(asset: Asset, accessor: Entry, values: np.ndarray) -> None:
-    """Puts the sparse values of an accessor in their places."""
+    """Writes the sparse values of an accessor to their rows."""
     sparse = part_of(accessor, "sparse")
     count, indices = whole_in(sparse, "count"), part_of(sparse, "indices")
     if whole_in(indices, "componentType") not in (5121, 5123, 5125) or not count:
@@ -236,7 +229,7 @@ def fill_sparse(asset: Asset, accessor: Entry, values: np.ndarray) -> None:
 
 
 def normalised(values: np.ndarray, accessor: Entry) -> Float[np.ndarray, "N k"]:
-    """Returns values as floats: whole numbers as shares of their largest where the accessor is normalised."""
+    """Converts values to floats; integers of a normalised accessor become shares of their maximum."""
     with np.errstate(invalid="ignore"):  # nan of any kind
         floats = values.astype(float)
     if values.dtype.kind == "f" or accessor.get("normalized") is not True:

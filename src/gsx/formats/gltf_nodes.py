@@ -1,6 +1,7 @@
-"""Nodes of glTF: where each mesh of a scene lies, and splats moved there."""
+"""Nodes of glTF: the transform of each mesh of a scene, and its application to splats."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,18 +14,16 @@ from gsx.formats.gltf_asset import LARGEST, Entry, entry_at, list_in, numbers_in
 from gsx.formats.turned import product, turned_harmonics
 
 SHEAR = 1e-3
-"""Cosine between a node's axes up to which they count as orthogonal."""
+"""Largest cosine between orthogonal axes of a node."""
 EQUAL = 1e-6
-"""Relative difference of scales that counts as none."""
+"""Largest relative difference of equal scales."""
 ROUNDING = 1e-12
-"""Difference from a whole number that is rounding alone."""
+"""Largest rounding error of a whole number."""
 IDENTITY = np.eye(4)
 
 
 def placed_meshes(document: Entry) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
-    """Yields the index of each mesh of the scene and the matrix to the world, once for each node that has it.
-
-    A document without nodes has its meshes in the world.
+    """Yields (index of a mesh, its matrix to the world) for each node with a mesh; the identity without nodes.
 
     Raises:
         InputError: nodes are no trees, or one is damaged.
@@ -39,7 +38,7 @@ def placed_meshes(document: Entry) -> Iterator[tuple[int, Float[np.ndarray, "4 4
         if index in visited:
             raise InputError(f"its node {index} has two parents: export it anew")
         visited.add(index)
-        with np.errstate(over="ignore", invalid="ignore"):  # refused where splats are moved by it
+        with np.errstate(over="ignore", invalid="ignore"):  # `moved` refuses it
             matrix = world_from_parent @ node_matrix(node)
         if "mesh" in node:
             yield node["mesh"], matrix
@@ -47,7 +46,7 @@ def placed_meshes(document: Entry) -> Iterator[tuple[int, Float[np.ndarray, "4 4
 
 
 def roots(document: Entry) -> list[int]:
-    """Returns the root nodes of the scene that is displayed; without scenes, nodes that are no children."""
+    """Returns the root nodes of the displayed scene; without scenes, nodes that are no children."""
     if list_in(document, "scenes"):
         return list_in(entry_at(document, "scenes", document.get("scene", 0)), "nodes")
     nodes = range(len(list_in(document, "nodes")))
@@ -57,7 +56,7 @@ def roots(document: Entry) -> list[int]:
 
 
 def node_matrix(node: Entry) -> Float[np.ndarray, "4 4"]:
-    """Returns the matrix from a node to its parent: as stored, column by column, or translation, rotation, scale."""
+    """Returns the matrix from a node to its parent: as stored by columns, or by translation, rotation and scale."""
     if "matrix" in node:
         return numbers_in(node, "matrix", IDENTITY.flatten().tolist()).reshape(4, 4).T
     x, y, z, w = numbers_in(node, "rotation", (0.0, 0.0, 0.0, 1.0))
@@ -69,22 +68,18 @@ def node_matrix(node: Entry) -> Float[np.ndarray, "4 4"]:
 
 
 def moved(arrays: Arrays, matrix: Float[np.ndarray, "4 4"]) -> Arrays:
-    """Returns splats where every point p is `matrix` (p, 1): a rotation after positive scales, and a translation.
-
-    Colours turn with the rotation (KHR_gaussian_splatting, "Splat Lighting").
+    """Maps every point p of splats to `matrix` (p, 1); colours turn (KHR_gaussian_splatting, "Splat Lighting").
 
     Raises:
-        InputError: the matrix mirrors, shears or flattens.
+        InputError: the matrix is no rotation after positive scales, and translation.
     """
     if not np.abs(matrix).max() < LARGEST:
         raise InputError("a node lies beyond all numbers: export it with its transform applied")
     if np.abs(matrix - IDENTITY).max() < ROUNDING:
         return arrays
     linear, scale = matrix[:3, :3], np.linalg.norm(matrix[:3, :3], axis=0)
-    rotation = unscaled(linear, scale)
-    turn = torch.from_numpy(rotation)
-    uniform = float(scale.max() - scale.min()) <= EQUAL * float(scale.max())
-    if uniform:
+    turn = torch.from_numpy(unscaled(linear, scale))
+    if float(scale.max() - scale.min()) <= EQUAL * float(scale.max()):
         log_scales = arrays.log_scales + np.log(scale.mean())
         quats = product(quaternions_of(turn[None])[0], torch.from_numpy(arrays.quats)).numpy()
     else:
@@ -92,18 +87,12 @@ def moved(arrays: Arrays, matrix: Float[np.ndarray, "4 4"]) -> Arrays:
     rest = arrays.sh_rest
     if arrays.degree:
         rest = sharpened(turned_harmonics(turn, arrays.degree).numpy()) @ rest
-    return Arrays(
-        means=arrays.means @ linear.T + matrix[:3, 3],
-        log_scales=log_scales,
-        quats=quats,
-        opacities=arrays.opacities,
-        sh_dc=arrays.sh_dc,
-        sh_rest=rest,
-    )
+    means = arrays.means @ linear.T + matrix[:3, 3]
+    return replace(arrays, means=means, log_scales=log_scales, quats=quats, sh_rest=rest)
 
 
 def unscaled(linear: Float[np.ndarray, "3 3"], scale: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Returns the rotation of a node, whose columns are as long as `scale`."""
+    """Returns the rotation of a node from its columns of lengths `scale`."""
     if scale.min() < 1 / LARGEST:
         raise InputError("a node has a scale of 0: export it with its transform applied")
     axes = linear / scale
@@ -116,17 +105,14 @@ def unscaled(linear: Float[np.ndarray, "3 3"], scale: Float[np.ndarray, "3"]) ->
 
 
 def sharpened(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Returns a matrix without rounding: whole numbers where it is that close to them."""
+    """Rounds entries within ROUNDING of whole numbers."""
     return np.where(np.abs(matrix - matrix.round()) < ROUNDING, matrix.round(), matrix)
 
 
 def stretched(
     arrays: Arrays, linear: Float[np.ndarray, "3 3"]
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 4"]]:
-    """Returns logarithms of scales, and quaternions, of splats after a map that is no similarity.
-
-    The covariance becomes M C C^T M^T, whose principal axes are the left singular vectors of M C.
-    """
+    """Returns (log-scales, quaternions) of splats with covariance C C^T after a linear map M, by the SVD of M C."""
     own = rotation_matrices(torch.from_numpy(arrays.quats)).numpy() * np.exp(arrays.log_scales)[:, None]
     left, scales, _ = np.linalg.svd(linear @ own)
     left[:, :, 2] *= np.sign(np.linalg.det(left))[:, None]

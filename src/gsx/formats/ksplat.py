@@ -1,9 +1,9 @@
 """`.ksplat`, version 0.1 (mkkellogg/GaussianSplats3D, MIT): a header, headers of sections, and the sections.
 
 A section has the sizes of its partly filled buckets, the centres of all buckets, and its splats. Compression level 0
-holds floats. Levels 1 and 2 hold positions in 16 bits around the centre of a bucket; scales and quaternions, which
-begin with w, as halves. Coefficients of higher bands are halves in level 1, bytes in level 2. Axes are those of
-training worlds. Damaged content raises InputError, which calls the file "it".
+has floats; levels 1 and 2 have positions of 16 bits around the centre of a bucket, halves for scales and quaternions
+(w first), and for higher bands halves (1) or bytes (2). Axes are those of training worlds. Damaged content raises
+InputError, which calls the file "it".
 """
 
 import struct
@@ -21,39 +21,20 @@ HEADER_BYTES, SECTION_BYTES = 4096, 1024
 HEADER = struct.Struct("<BB2xIIIIHxx3fff")
 """Version, most sections, sections, most splats, splats, level, centre of the scene, range of coefficients in bytes."""
 SECTION = struct.Struct("<IIIIfHxxIIIIH")
-"""Splats, most splats, bucket size, buckets, side of a bucket's block, bytes of a bucket, range, bytes, full buckets,
-partly filled ones, degree."""
+"""Fields of `Section`."""
 MAJOR, LEAST_MINOR = 0, 1
 CENTRE_BYTES = 12
 """Bytes of a bucket's centre."""
 HALF_RANGE = 32767
-"""Steps from a bucket's centre to its side, where a section states none."""
+"""Default of the steps from a bucket's centre to its side."""
 COEFFICIENT_RANGE = 1.5
-"""Largest coefficient in bytes, where the header states none."""
+"""Default of the largest coefficient in bytes."""
 BANDS = {0: (), 1: (3,), 2: (3, 5), 3: (3, 5, 7)}
 """Coefficients of each band, by degree."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Level:
-    """Types in which a level of compression holds its values."""
-
-    mean: str
-    value: str
-    """Type of scales and quaternions."""
-    coefficient: str
-
-    def row(self, coefficients: int) -> np.dtype:
-        """Returns the type of a splat's row; coefficients: number without the constant ones, of all colours."""
-        parts = [("mean", self.mean, 3), ("scale", self.value, 3), ("quat", self.value, 4), ("colour", "u1", 4)]
-        return np.dtype([*parts, ("rest", self.coefficient, coefficients)])
-
-
-LEVELS = (
-    Level(mean="<f4", value="<f4", coefficient="<f4"),
-    Level(mean="<u2", value="<f2", coefficient="<f2"),
-    Level(mean="<u2", value="<f2", coefficient="u1"),
-)
+LEVELS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
+"""Types of positions, of scales and quaternions, and of coefficients, by level of compression."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,21 +68,23 @@ class Section(NamedTuple):
 
     @property
     def splats(self) -> int:
-        """Returns the number of splats; some writers leave `most` at 0."""
+        """Return the number of splats; some writers leave `most` at 0."""
         return self.most or self.loaded
 
     @property
     def coefficients(self) -> int:
-        """Returns the number of coefficients without the constant ones, of all colours."""
+        """Return the number of coefficients without the constant ones, of all colours."""
         return 3 * sum(BANDS[self.degree])
+
+    def row(self, level: int) -> np.dtype:
+        """Returns the type of a splat's row at a level of compression."""
+        mean, value, coefficient = LEVELS[level]
+        parts = [("mean", mean, 3), ("scale", value, 3), ("quat", value, 4), ("colour", "u1", 4)]
+        return np.dtype([*parts, ("rest", coefficient, self.coefficients)])
 
 
 def decode_ksplat(content: bytes) -> Arrays:
-    """Returns the splats of a file; rows may hold values that are not finite.
-
-    Raises:
-        InputError: it is damaged, of another version, or its counts contradict each other.
-    """
+    """Decodes a file, rows with NaN or inf included; InputError: it is damaged, or of another version."""
     header = header_of(content)
     start = HEADER_BYTES + header.sections * SECTION_BYTES
     if len(content) < start:
@@ -152,8 +135,8 @@ def section_of(content: bytes, number: int, level: int) -> Section:
 
 
 def splats_of(content: bytes, start: int, section: Section, header: Header) -> tuple[Arrays, int]:
-    """Returns the splats of a section that begins at a byte, and where it ends."""
-    kind = LEVELS[header.level].row(section.coefficients)
+    """Returns (splats of a section that begins at byte `start`, byte of its end)."""
+    kind = section.row(header.level)
     centres = start + 4 * section.partial
     first = centres + section.bucket_bytes * section.buckets
     end = first + section.splats * kind.itemsize
@@ -178,7 +161,7 @@ def splats_of(content: bytes, start: int, section: Section, header: Header) -> t
 
 
 def buckets_of(partial: Int[np.ndarray, "P"], section: Section) -> Int[np.ndarray, "N"]:
-    """Returns the bucket of each splat of a section; partial: sizes of the buckets that are not full."""
+    """Returns the bucket of each splat; partial: sizes of the buckets that are not full."""
     held = section.full * section.bucket_size + int(partial.sum())
     if held != section.splats:
         raise InputError(f"its buckets hold {held:,} splats, their section {section.splats:,}: save it anew")
@@ -194,7 +177,7 @@ def coefficients_of(stored: np.ndarray, header: Header) -> Float[np.ndarray, "N 
 
 
 def higher_bands(values: Float[np.ndarray, "N C"], degree: int) -> Float[np.ndarray, "N B 3"]:
-    """Returns coefficients as (coefficient, colour); in a file each band has all of red, then green, then blue."""
+    """Returns coefficients as (coefficient, colour); each band of a file has all of red, then green, then blue."""
     bands, begin = [np.zeros((len(values), 0, 3))], 0
     for size in BANDS[degree]:
         bands.append(values[:, begin : begin + 3 * size].reshape(-1, 3, size).transpose(0, 2, 1))

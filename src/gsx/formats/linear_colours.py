@@ -1,4 +1,4 @@
-"""Harmonics of linear light made into harmonics of sRGB, in which gsx trains and blends."""
+"""Conversion of harmonics of linear light to sRGB, in which gsx trains and blends."""
 
 import logging
 from dataclasses import replace
@@ -16,14 +16,13 @@ from gsx.formats.turned import DIRECTIONS, spread_directions
 logger = logging.getLogger(__name__)
 
 AT_ONCE = 4096
-"""Splats whose colours in all directions are held at once."""
+"""Splats converted at a time."""
 
 
 def srgb_of_linear(arrays: Arrays, name: str) -> Arrays:
-    """Returns splats of which each shows in sRGB the colour that it has in linear light.
+    """Converts colours of splats from linear light to sRGB, and logs the error with the file's name.
 
-    Exact for degree 0. Higher degrees are fitted by least squares over directions spread evenly, and the log has the
-    error. Where splats blend, linear light blends otherwise: pictures then differ. name: of the file.
+    Exact for degree 0; higher degrees are least-squares fits over evenly spread directions. Blends of splats differ.
     """
     basis = basis_of(arrays.degree)
     linear = np.concatenate([arrays.sh_dc[:, None], arrays.sh_rest], 1)
@@ -31,7 +30,8 @@ def srgb_of_linear(arrays: Arrays, name: str) -> Arrays:
     coefficients = np.empty_like(linear)
     for start in range(0, len(linear), AT_ONCE):
         rows = slice(start, start + AT_ONCE)
-        colours = encoded(np.maximum(0.5 + basis @ linear[rows], 0))
+        light = torch.from_numpy(np.maximum(0.5 + basis @ linear[rows], 0))
+        colours = display_from_linear(light, limited=False).numpy()  # beyond 1 by the same formula
         coefficients[rows] = fit @ (colours - 0.5)
         errors = np.maximum(0.5 + basis @ coefficients[rows], 0) - colours
         squares, most = squares + float((errors**2).sum()), max(most, float(np.abs(errors).max()))
@@ -42,13 +42,8 @@ def srgb_of_linear(arrays: Arrays, name: str) -> Arrays:
 
 
 def basis_of(degree: int) -> Float[np.ndarray, "D B"]:
-    """Returns all harmonics up to a degree, the constant one first, in directions spread evenly; one for degree 0."""
+    """Returns all harmonics up to a degree in evenly spread directions, the constant one first."""
     if not degree:
         return np.full((1, 1), BAND_0)
     rest = harmonics(spread_directions(DIRECTIONS), degree).numpy()
     return np.concatenate([np.full((len(rest), 1), BAND_0), rest], 1)
-
-
-def encoded(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Returns sRGB of linear light >= 0, beyond 1 by the same formula."""
-    return display_from_linear(torch.from_numpy(linear), limited=False).numpy()

@@ -1,7 +1,7 @@
 """PLY files: tables of scalars by element, such as vertices of splats and of point clouds (3D-GS, save_ply).
 
-Reads ascii and both binary byte orders, writes binary little-endian. Other elements than the wanted one are skipped,
-also those before it and those with lists, such as faces. Damaged content raises InputError, which calls the file "it".
+Reads ascii and both binary byte orders, writes binary little-endian. Skips other elements, also with lists, such as
+faces. Damaged content raises InputError, which calls the file "it".
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,34 +17,34 @@ from gsx.core.files import refuse_lfs_pointer, replace_file
 TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 TYPES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"}
 TYPES |= {"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
-"""numpy's names of PLY's types, under both generations of names; the first name of each is written."""
+"""numpy's names of PLY's types by their old and new names; files are written with the old ones."""
 ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
-"""numpy's mark of the byte order of each kind of body."""
+"""numpy's byte order of each format."""
 VERTICES = "vertex"
 """The element of points and splats."""
 
 HEADER_END = b"\nend_header"
 """Last line of a header."""
 MOST_DIGITS = 15
-"""Digits of a number of rows: a file with more does not exist."""
+"""Most digits of a number of rows."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Element:
-    """One element of a header: its name, its number of rows, and its properties in order."""
+    """One element of a header."""
 
     name: str
     count: int
     properties: tuple[tuple[str, str, str], ...]
-    """(name, numpy's type of its values, that of a list's length; empty for a scalar)."""
+    """(name, numpy's type of values, type of a list's length or '' for a scalar), in order."""
 
     @property
     def scalar(self) -> bool:
-        """Returns whether no property is a list: all rows are of one size."""
+        """Return whether no property is a list, so that all rows have one size."""
         return not any(length for _, _, length in self.properties)
 
     def row(self, order: str, lengths: Sequence[int] = ()) -> np.dtype:
-        """Returns the type of one row; `lengths`: of its lists, in order."""
+        """Returns the type of a row with lists of these lengths."""
         rest, fields = iter(lengths), []
         for number, (name, kind, length) in enumerate(self.properties):
             if length:
@@ -59,7 +59,7 @@ class Header:
     """The header of a PLY."""
 
     size: int
-    """Bytes up to the body."""
+    """Bytes before the body."""
     layout: str
     """A key of ORDERS."""
     elements: tuple[Element, ...]
@@ -69,10 +69,10 @@ class Header:
 
 
 def read_ply(path: str | Path) -> dict[str, np.ndarray]:
-    """Returns the vertex properties by name, each an array [vertices] of the type stored.
+    """Returns the vertex properties as stored, arrays [vertices] by name.
 
     Raises:
-        InputError: the file is missing, is no PLY with vertices of scalars, or ends early.
+        InputError: the file is missing, damaged, or has no vertices of scalars.
     """
     path = Path(path)
     if not path.is_file():
@@ -85,11 +85,7 @@ def read_ply(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def vertices_of(content: bytes) -> dict[str, np.ndarray]:
-    """Returns the vertex properties of a file's content, in native byte order.
-
-    Raises:
-        InputError: as `read_ply`; the file is called "it".
-    """
+    """Returns the vertex properties of a file's content in native byte order; errors as `read_ply`."""
     header = header_in(content)
     position = next((i for i, element in enumerate(header.elements) if element.name == VERTICES), -1)
     if position < 0:
@@ -105,14 +101,13 @@ def vertices_of(content: bytes) -> dict[str, np.ndarray]:
 
 
 def elements_of(content: bytes) -> dict[str, np.ndarray]:
-    """Returns all elements of scalars by name, as structured arrays."""
+    """Returns all elements of scalars as structured arrays, by name."""
     header = header_in(content)
-    elements = enumerate(header.elements)
-    return {element.name: table_at(content, header, i) for i, element in elements if element.scalar}
+    return {one.name: table_at(content, header, i) for i, one in enumerate(header.elements) if one.scalar}
 
 
 def table_at(content: bytes, header: Header, position: int) -> np.ndarray:
-    """Returns the rows of the element at a position, which has no lists."""
+    """Returns the rows of the element at a position, which must have no lists."""
     element = header.elements[position]
     if header.layout == "ascii":
         return _ascii(content[header.size :], header.elements[:position], element)
@@ -127,11 +122,7 @@ def table_at(content: bytes, header: Header, position: int) -> np.ndarray:
 
 
 def header_in(content: bytes) -> Header:
-    """Returns the header of a file, which may have lost its body.
-
-    Raises:
-        InputError: it has none, or one that contradicts itself.
-    """
+    """Returns the header of a file, with or without body; InputError: it has none, or an invalid one."""
     size = header_length(content)
     if not content.startswith(b"ply") or not size:
         raise InputError("it has no complete PLY header: export it anew as PLY")
@@ -143,13 +134,13 @@ def header_in(content: bytes) -> Header:
 
 
 def header_length(content: bytes) -> int:
-    """Returns the bytes of a PLY's header; 0 where it has no end. A comment may hold the word that ends it."""
+    """Returns the bytes of a PLY's header; 0: it has no end. A comment may contain the word that ends it."""
     end = content.find(HEADER_END)
     return content.find(b"\n", end + 1) + 1 if end >= 0 else 0
 
 
 def length_of(head: bytes) -> int:
-    """Returns the bytes of the binary file that begins so, by its header."""
+    """Returns the bytes of a binary file by its header."""
     header = header_in(head)
     if header.layout == "ascii" or not all(element.scalar for element in header.elements):
         raise InputError("it has no header of a binary PLY of scalars: export it anew")
@@ -175,7 +166,7 @@ def _elements(lines: list[list[str]]) -> Iterable[Element]:
 
 
 def _property(words: list[str], element: str) -> tuple[str, str, str]:
-    """Returns (name, type, type of a list's length) of a line of a header."""
+    """Returns (name, type, type of a list's length) by a line of a header."""
     if len(words) == 3 and words[1] in TYPES:
         return words[2], TYPES[words[1]], ""
     if len(words) == 5 and words[1] == "list" and {words[2], words[3]} <= TYPES.keys() and TYPES[words[2]][0] != "f":
@@ -191,7 +182,7 @@ def _size(content: bytes, start: int, element: Element, order: str) -> int:
         return 0
     equal = element.row(order, _row_end(content, start, element, order)[1])
     size = element.count * equal.itemsize
-    if len(content) - start >= size:  # faces often have one number of corners
+    if len(content) - start >= size:  # faces often have equally many corners
         rows = np.frombuffer(content, equal, element.count, start)
         lengths = [rows[name] for name in equal.names or () if name.endswith(" length")]
         if all((values == values[0]).all() for values in lengths):
@@ -203,7 +194,7 @@ def _size(content: bytes, start: int, element: Element, order: str) -> int:
 
 
 def _row_end(content: bytes, start: int, element: Element, order: str) -> tuple[int, list[int]]:
-    """Returns the end of the row with lists that begins at a byte, and how long its lists are."""
+    """Returns (byte at which the row at `start` ends, lengths of its lists)."""
     lengths: list[int] = []
     for _, kind, length in element.properties:
         if length and start + np.dtype(length).itemsize <= len(content):
@@ -216,7 +207,7 @@ def _row_end(content: bytes, start: int, element: Element, order: str) -> tuple[
 
 
 def _ascii(body: bytes, before: Sequence[Element], element: Element) -> np.ndarray:
-    """Returns the rows of an element of a text file, one line each, after those of the elements before it."""
+    """Returns the rows of an element of a text file, a line each, after those of the elements `before`."""
     first = sum(other.count for other in before)
     lines = [line for line in body.decode("latin-1").splitlines() if line.strip()][first : first + element.count]
     table = element.row("<")
@@ -234,7 +225,7 @@ def _ascii(body: bytes, before: Sequence[Element], element: Element) -> np.ndarr
 
 
 def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Iterable[str] = ()) -> None:
-    """Writes arrays [vertices] of equal length as vertex properties; the file appears whole or not at all.
+    """Writes arrays [vertices] as vertex properties, atomically.
 
     Raises:
         InputError: the file cannot be written.
@@ -256,11 +247,7 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Writes a file of points or splats; it appears whole or not at all.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """Writes a file of points or splats atomically; InputError: it cannot be written."""
     try:
         replace_file(path, content)
     except OSError as problem:
@@ -268,7 +255,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def header_of(elements: Mapping[str, tuple[int, Mapping[str, str]]], comments: Iterable[str] = ()) -> bytes:
-    """Returns the header of a binary file; elements: rows of each, and its properties with PLY's types."""
+    """Returns the header of a binary file; elements: (rows, PLY's types of its properties) of each."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {plain(comment)}" for comment in comments)]
     for name, (count, properties) in elements.items():
         lines += [f"element {name} {count}", *(f"property {kind} {inner}" for inner, kind in properties.items())]
@@ -276,5 +263,5 @@ def header_of(elements: Mapping[str, tuple[int, Mapping[str, str]]], comments: I
 
 
 def plain(comment: str) -> str:
-    """Returns a comment in one line of ASCII, all that headers may hold; other characters become escapes."""
+    """Returns a comment as one line of ASCII; other characters become escapes."""
     return " ".join(comment.split()).encode("ascii", "backslashreplace").decode()

@@ -9,17 +9,17 @@ from torch.nn.functional import logsigmoid
 from gsx.core.shapes import Float
 
 LEAST_SHARE = 1e-30
-"""Of a scale in what the 3D filter makes of it: nothing is seen of a primitive near it, and gradients stay finite."""
+"""Lower bound of a scale over the filtered scale, for finite gradients; such a primitive is invisible."""
 LEAST_BEFORE, MOST_BEFORE = 0.1, 0.999
-"""Scales, of the filter, and opacities that a file's splats are taken to have had before the filter."""
+"""Least scale over the filter's size, and largest opacity, of `unsmoothed`."""
 
 
 def smoothed(
     scales: Float[Tensor, "N 3"], log_opacities: Float[Tensor, "N"], sizes: Float[Tensor, "N"]
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
-    """Scales and log-opacities after the 3D filter, differentiable in both (Mip-Splatting, get_scaling_with_3D_filter).
+    """Returns scales and log-opacities after the 3D filter, differentiable (Mip-Splatting, get_scaling_with_3D_filter).
 
-    The opacity falls by prod_k s_k / sqrt(s_k^2 + f^2), taken as a sum of logarithms: a product would underflow.
+    The opacity changes by prod_k s_k / sqrt(s_k^2 + f^2), as a sum of logarithms: a product would underflow.
     """
     wide = torch.hypot(scales, sizes[:, None])
     return wide, log_opacities + (scales / wide).clamp_min(LEAST_SHARE).log().sum(1)
@@ -28,7 +28,7 @@ def smoothed(
 def smoothed_raw(
     log_scales: Float[Tensor, "N 3"], opacity_logits: Float[Tensor, "N"], sizes: Float[Tensor, "N"]
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
-    """Log-scales and logits of what `smoothed` makes of those given."""
+    """Applies `smoothed` to log-scales and logits."""
     scales, log_opacities = smoothed(log_scales.exp(), logsigmoid(opacity_logits), sizes)
     return scales.log(), logit_of_log(log_opacities)
 
@@ -36,8 +36,7 @@ def smoothed_raw(
 def unsmoothed(
     log_scales: Float[Tensor, "N 3"], opacity_logits: Float[Tensor, "N"], sizes: Float[Tensor, "N"]
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
-    """Log-scales and logits that `smoothed_raw` makes into those given, as far as there are any: scales at least a
-    tenth of the filter, which would have no gradient at 0, and opacities below 1."""
+    """Inverts `smoothed_raw`; scales stay above a tenth of the filter (0 has no gradient), opacities below 1."""
     scales, sizes = log_scales.exp(), sizes[:, None]
     narrow = (scales.square() - sizes.square()).clamp_min(0).sqrt().maximum(LEAST_BEFORE * sizes)
     log_opacities = logsigmoid(opacity_logits) + (scales.maximum(sizes) / narrow).log().sum(1)
@@ -45,6 +44,6 @@ def unsmoothed(
 
 
 def logit_of_log(log_opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
-    """ln(o / (1 - o)) from ln o <= 0, accurate at both ends: logsigmoid backwards."""
+    """Returns ln(o / (1 - o)) from ln o <= 0, accurate at both ends: the inverse of logsigmoid."""
     below = log_opacities.clamp_max(-torch.finfo(log_opacities.dtype).tiny)
     return below - torch.log(-torch.expm1(below))

@@ -1,7 +1,7 @@
-"""SOG, version 2: a ZIP of lossless WebP pictures and meta.json, of PlayCanvas (playcanvas/splat-transform, MIT).
+"""Writing of SOG 2 by PlayCanvas: a ZIP of meta.json and lossless WebP pictures (playcanvas/splat-transform, MIT).
 
-A pixel is a splat in every picture. Axes are those of training worlds, as splat-transform writes them. Pillow writes
-WebP (`gsx[sog]`). `sog_reading` reads both versions.
+A pixel is a splat in every picture. Axes are those of training worlds, as in splat-transform. Pillow writes WebP
+(`gsx[sog]`). `sog_reading` reads both versions.
 """
 
 import io
@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from gsx.core.errors import InputError
 from gsx.core.packages import require
 from gsx.core.shapes import Float, Int, UInt8
 from gsx.formats.arrays import Arrays, rounded, smallest_three
@@ -23,23 +22,18 @@ VERSION = 2
 BOOK = 256
 """Entries of a code book of numbers."""
 PALETTE = 64
-"""Vectors of higher bands in a row of their picture; and at most so many times 1024 in all."""
+"""Vectors of higher bands in a row of their picture; at most 1024 rows."""
 FIRST_LARGEST = 252
-"""Alpha of quaternions whose first component is the largest."""
+"""Alpha of a quaternion whose first component is the largest."""
 HIGHER = ("shN_centroids.webp", "shN_labels.webp")
 COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 
 
 def encode_sog(arrays: Arrays, antialiased: bool = False) -> bytes:
-    """Encodes a file. antialiased: to be drawn with compensated opacities, as models of Mip-Splatting.
+    """Encodes a file of at least one splat; ConfigError: Pillow is not installed.
 
-    Raises:
-        InputError: there are no splats.
-        ConfigError: Pillow is not installed.
+    antialiased: opacities are compensated in renders, as in models of Mip-Splatting.
     """
-    count = len(arrays.means)
-    if count == 0:
-        raise InputError("SOG holds no empty scenes: the model has no splats")
     order = morton_order(arrays.means)
     logs = signed_log(arrays.means[order])
     least, most = logs.min(0), logs.max(0)
@@ -48,7 +42,7 @@ def encode_sog(arrays: Arrays, antialiased: bool = False) -> bytes:
     meta: dict[str, Any] = {
         "version": VERSION,
         "asset": {"generator": "gsx"},
-        "count": count,
+        "count": len(arrays.means),
         "means": {"mins": least.tolist(), "maxs": most.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scales.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},

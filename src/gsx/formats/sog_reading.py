@@ -1,8 +1,8 @@
-"""SOG, versions 1 and 2, from a ZIP or from a folder: meta.json and lossless pictures, a pixel a splat.
+"""Reading of SOG 1 and 2 from a ZIP or a folder: meta.json and lossless pictures, a pixel a splat.
 
-Version 1 (playcanvas/sogs) holds scales, colours and logits of opacities as bytes between a least and a most value;
-version 2 (playcanvas/splat-transform) holds indices of code books. Pillow reads the pictures (`gsx[sog]`). Damaged
-content raises InputError, which calls the file "it".
+Version 1 (playcanvas/sogs) has scales, colours and opacity logits as bytes between two bounds, version 2
+(playcanvas/splat-transform) as indices of code books. Pillow reads the pictures (`gsx[sog]`). Damaged content raises
+InputError, which calls the file "it".
 """
 
 import io
@@ -28,12 +28,12 @@ logger = logging.getLogger(__name__)
 
 MOST_SPLATS = 1 << 26
 SPARE_PIXELS = 1 << 22
-"""Pixels that a picture may have beyond four times those that it needs."""
+"""Most pixels of a picture beyond four times the splats."""
 COMPENSATED, FLAT = "antialiased", "2dgs"
 MODELS = (COMPENSATED, FLAT, "default")
 """Values of `model`."""
 BYTES_PER_PIXEL = 8
-"""More than any encoder needs for one."""
+"""Bound of the bytes per pixel of any encoder."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,13 +41,13 @@ class Archive:
     """Files of a SOG by name."""
 
     read: Callable[[str, int], bytes]
-    """Content of a file of at most so many bytes; raises InputError."""
+    """Returns the content of a file of at most this many bytes."""
     meta: dict[str, Any]
     """Content of meta.json."""
 
     @property
     def version(self) -> int:
-        """Returns the version, 1 where meta.json states none."""
+        """Return the version, 1 if meta.json states none."""
         version = self.meta.get("version", 1)
         if version not in (1, VERSION) or isinstance(version, bool):
             raise InputError(f"its meta.json has version {version!r}; gsx reads SOG 1 and 2: export it anew")
@@ -55,7 +55,7 @@ class Archive:
 
     @property
     def count(self) -> int:
-        """Returns the number of splats."""
+        """Return the number of splats."""
         parts = (self.meta.get(part) for part in ("means", "scales", "quats", "sh0"))
         shapes = [part["shape"] for part in parts if isinstance(part, dict) and "shape" in part]
         stated = [self.meta["count"]] if "count" in self.meta else []
@@ -68,49 +68,45 @@ class Archive:
 
 
 def decode_sog(content: bytes, path: Path) -> Arrays:
-    """Returns the splats of a ZIP, or of a meta.json and the pictures next to it. path: of the file.
+    """Decodes a ZIP, or a meta.json with its folder. path: of the file.
 
     Raises:
-        InputError: it is damaged, of another version, or of flat splats.
+        InputError: it is damaged, of another version, or has flat splats.
         ConfigError: Pillow is not installed.
     """
     require("SOG", ("PIL",), "gsx[sog]")
     archive = archive_of(content, path)
-    refuse_model(archive.meta)
+    model = archive.meta.get("model", "default")
+    if model == FLAT:
+        raise InputError(f"its meta.json has model '{FLAT}': it holds flat splats, which gsx does not draw")
+    if model not in MODELS:
+        logger.warning("meta.json has the unknown model %r: its splats are drawn as usual ones", model)
     try:
-        with np.errstate(all="ignore"):  # `finite` refuses what overflows
-            return finite(splats_in(archive))
+        with np.errstate(all="ignore"):  # the check below refuses what overflows
+            arrays = splats_in(archive)
     except InputError:
         raise
-    except Exception as error:  # of JSON's and pictures' content: all say that it is damaged
+    except Exception as error:  # any error of its content means damage
         raise InputError(f"it is no whole SOG ({type(error).__name__}): export it anew") from None
+    for name, values in vars(arrays).items():
+        if not np.isfinite(values).all():
+            raise InputError(f"its ranges or code books give '{name}' that are not finite: export it anew")
+    return arrays
 
 
 def sog_is_antialiased(path: Path) -> bool:
-    """Returns whether meta.json states that opacities are compensated; False for what is no SOG.
-
-    `model` (splat-transform since 3.2) counts before the older `antialias`.
-    """
+    """Returns whether meta.json states compensated opacities, by `model` or the older `antialias`; False for no SOG."""
     try:
         meta = archive_of(path.read_bytes(), path).meta
-    except (InputError, OSError):  # the reader reports it
+    except (InputError, OSError):  # the decoder reports it
         return False
     if "model" in meta:
         return bool(meta["model"] == COMPENSATED)
     return meta.get("antialias") is True
 
 
-def refuse_model(meta: dict[str, Any]) -> None:
-    """Raises InputError for flat splats; a model that gsx does not know is a warning."""
-    model = meta.get("model", "default")
-    if model == FLAT:
-        raise InputError(f"its meta.json has model '{FLAT}': it holds flat splats, which gsx does not draw")
-    if model not in MODELS:
-        logger.warning("meta.json has model %r, which gsx does not know: its splats are drawn as usual ones", model)
-
-
 def archive_of(content: bytes, path: Path) -> Archive:
-    """Returns the files of a ZIP, or of the folder of a meta.json. path: of the file with that content."""
+    """Returns the files of a ZIP, or of the folder of a meta.json. path: of the file."""
     read = in_folder(path) if path.name.lower() == META else in_zip(content)
     try:
         meta = json.loads(read(META, MOST_META))
@@ -122,7 +118,7 @@ def archive_of(content: bytes, path: Path) -> Archive:
 
 
 def in_folder(path: Path) -> Callable[[str, int], bytes]:
-    """Returns a reader of the files next to a meta.json."""
+    """Returns a reader of the files in the folder of a meta.json."""
 
     def read(name: str, most: int) -> bytes:
         file = path if name == META else path.parent / name
@@ -138,14 +134,10 @@ def in_folder(path: Path) -> Callable[[str, int], bytes]:
 
 
 def in_zip(content: bytes) -> Callable[[str, int], bytes]:
-    """Returns a reader of the files of a ZIP, which lie in its root or all in one folder.
-
-    Raises:
-        InputError: it is no ZIP, or has no or several meta.json.
-    """
+    """Returns a reader of a ZIP's files, in its root or one folder; InputError: no ZIP, or not one meta.json."""
     try:
         entries = {info.filename: info for info in zipfile.ZipFile(io.BytesIO(content)).infolist()}
-    except Exception as error:  # a damaged ZIP raises errors of many kinds
+    except Exception as error:  # damage raises errors of many kinds
         raise InputError(f"it is no whole ZIP ({type(error).__name__}): copy or export it anew") from None
     folder = folder_of_meta(list(entries))
 
@@ -158,7 +150,7 @@ def in_zip(content: bytes) -> Callable[[str, int], bytes]:
         try:
             with zipfile.ZipFile(io.BytesIO(content)) as archive:
                 return archive.read(info)
-        except Exception as error:  # damaged, encrypted, or packed in a way that Python does not know
+        except Exception as error:  # damaged, encrypted, or of an unknown compression
             problem = type(error).__name__
             raise InputError(f"its '{name}' cannot be unpacked ({problem}): copy or export it anew") from None
 
@@ -166,11 +158,7 @@ def in_zip(content: bytes) -> Callable[[str, int], bytes]:
 
 
 def folder_of_meta(names: list[str]) -> PurePosixPath:
-    """Returns the folder of a ZIP in which meta.json lies.
-
-    Raises:
-        InputError: there is none, or several.
-    """
+    """Returns the folder of meta.json in a ZIP; InputError: there is none, or several."""
     paths = [PurePosixPath(name) for name in names if not name.startswith("__MACOSX/")]
     folders = sorted({path.parent for path in paths if path.name == META}, key=lambda folder: len(folder.parts))
     if not folders:
@@ -181,7 +169,7 @@ def folder_of_meta(names: list[str]) -> PurePosixPath:
 
 
 def splats_in(archive: Archive) -> Arrays:
-    """Returns the splats of the files; damaged content raises errors of many kinds."""
+    """Decodes the files; damage raises errors of many kinds."""
     meta, count = archive.meta, archive.count
     first = archive.version == 1
     least, most = (np.array(meta["means"][end], float) for end in ("mins", "maxs"))
@@ -201,7 +189,7 @@ def splats_in(archive: Archive) -> Arrays:
 
 
 def interpolated(entry: dict[str, Any], stored: UInt8[np.ndarray, "N k"]) -> Float[np.ndarray, "N k"]:
-    """Returns values of version 1: bytes between the least and the most of each column."""
+    """Returns values of version 1: bytes between the bounds of each column."""
     least, most = (np.array(entry[end], float) for end in ("mins", "maxs"))
     if least.shape not in ((), (1,), stored.shape[1:]) or most.shape != least.shape:
         raise InputError(f"its ranges are of {least.size} columns, its picture has {stored.shape[1]}: export it anew")
@@ -210,19 +198,14 @@ def interpolated(entry: dict[str, Any], stored: UInt8[np.ndarray, "N k"]) -> Flo
 
 def looked_up(entry: dict[str, Any], indices: UInt8[np.ndarray, "N k"]) -> Float[np.ndarray, "N k"]:
     """Returns values of version 2: entries of a code book."""
-    return code_book(entry)[indices]
-
-
-def code_book(entry: dict[str, Any]) -> Float[np.ndarray, "E"]:
-    """Returns a code book; a first entry that is null, as early writers left it, continues the steps of the others."""
     book = np.array(entry["codebook"], float)
-    if len(book) == BOOK and entry["codebook"][0] is None:
+    if len(book) == BOOK and entry["codebook"][0] is None:  # early writers left it out: extrapolate
         book[0] = book[1] + (book[1] - book[-1]) / (BOOK - 1)
-    return book
+    return book[indices]
 
 
 def quaternions(entry: dict[str, Any], stored: UInt8[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
-    """Returns unit quaternions (w, x, y, z); an alpha that names no component stands for the identity."""
+    """Returns unit quaternions (w, x, y, z); the identity for an invalid alpha."""
     encoding = entry.get("encoding", "quaternion_packed")
     if encoding != "quaternion_packed":
         raise InputError(f"its quaternions are encoded as {encoding!r}; gsx reads quaternion_packed: export it anew")
@@ -232,7 +215,7 @@ def quaternions(entry: dict[str, Any], stored: UInt8[np.ndarray, "N 4"]) -> Floa
 
 
 def rest_of(archive: Archive) -> Float[np.ndarray, "N B 3"]:
-    """Returns coefficients of higher bands: of a palette of vectors, the one that a splat's label names."""
+    """Returns coefficients of higher bands, entries of a palette by the splats' labels."""
     entry = archive.meta["shN"]
     centroids = picture(archive, entry["files"][0], 1)
     bands = {64 * count: count for count in COEFFICIENTS.values()}
@@ -253,13 +236,13 @@ def rest_of(archive: Archive) -> Float[np.ndarray, "N B 3"]:
 
 
 def pixels(archive: Archive, part: str, number: int = 0) -> UInt8[np.ndarray, "N 4"]:
-    """Returns the pixels of all splats in a picture of a part of meta.json."""
+    """Returns the splats' pixels in a picture of a part of meta.json."""
     name = archive.meta[part]["files"][number]
     return picture(archive, name, archive.count).reshape(-1, 4)[: archive.count]
 
 
 def picture(archive: Archive, name: str, needed: int) -> UInt8[np.ndarray, "H W 4"]:
-    """Returns a lossless picture as RGBA; needed: its least number of pixels."""
+    """Returns a lossless picture as RGBA; needed: least number of pixels."""
     from PIL import Image
 
     most = 4 * max(needed, archive.count) + SPARE_PIXELS
@@ -277,11 +260,3 @@ def picture(archive: Archive, name: str, needed: int) -> UInt8[np.ndarray, "H W 
             return np.asarray(image.convert("RGBA"))
     except Exception as error:  # of Pillow's decoders
         raise InputError(f"'{name}' is no whole picture ({type(error).__name__}): copy or export it anew") from None
-
-
-def finite(arrays: Arrays) -> Arrays:
-    """Returns splats whose values are all finite."""
-    for name, values in vars(arrays).items():
-        if not np.isfinite(values).all():
-            raise InputError(f"its ranges or code books give '{name}' that are not finite: export it anew")
-    return arrays

@@ -1,8 +1,7 @@
 """`.splat`: 32 bytes a splat without a header (antimatter15/splat, MIT).
 
-Three float32 of the position, three of the scale (linear), four bytes of colour and opacity, four of the quaternion
-(w, x, y, z). It has no spherical harmonics and does not say by which filter it is drawn. Axes are those of training
-worlds.
+Three float32 of the position, three of the linear scale, four bytes of colour and opacity, four of the quaternion
+(w, x, y, z). No spherical harmonics, no filter. Axes are those of training worlds.
 """
 
 import numpy as np
@@ -14,17 +13,13 @@ from gsx.formats.arrays import Arrays, unit_quaternions
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("quat", "u1", 4)])
 ZERO = 128
-"""Byte of a quaternion's component that is 0; a step is 1/128, as the format's own viewer reads it."""
+"""Byte of a quaternion component 0; a step is 1/128, as in the format's viewer."""
 SMALLEST_SCALE = 1e-30
-"""Scales of 0 are read as this: their logarithms are finite."""
+"""Scale in place of 0, whose logarithm is infinite."""
 
 
 def decode_splat(content: bytes) -> Arrays:
-    """Returns the splats of a file; rows may hold values that are not finite.
-
-    Raises:
-        InputError: it is empty, or no whole number of rows long.
-    """
+    """Decodes a file, rows with NaN or inf included; InputError: its length is no positive multiple of a row."""
     if not content:
         raise InputError("it is empty: copy or export it anew")
     if len(content) % ROW.itemsize:
@@ -43,11 +38,11 @@ def decode_splat(content: bytes) -> Arrays:
 
 
 def log_scales_of(scales: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """Returns logarithms of linear scales; those of negative ones are nan."""
+    """Returns logarithms of linear scales; NaN for negative ones."""
     with np.errstate(invalid="ignore"):
         return np.log(np.where(scales == 0, SMALLEST_SCALE, scales))
 
 
 def constants_of(colours: UInt8[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """Returns coefficients of the constant band of colours in bytes."""
+    """Returns constant-band coefficients of colours in bytes."""
     return (colours / 255 - 0.5) / BAND_0

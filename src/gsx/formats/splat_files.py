@@ -1,4 +1,4 @@
-"""Splat files by suffix: the standard 62-property PLY of 3D-GS (3D-GS, save_ply), and compact ones."""
+"""Splat files of all formats: the standard 62-property PLY of 3D-GS (3D-GS, save_ply), and compact ones."""
 
 import logging
 from collections.abc import Sequence
@@ -32,17 +32,17 @@ from gsx.formats.suffixes import SPZ_VERSIONS, STANDARD, WRITTEN, splat_file_at,
 logger = logging.getLogger(__name__)
 
 DECODERS = {".compressed.ply": decode_compressed_ply, ".splat": decode_splat, ".ksplat": decode_ksplat}
-"""Decoders that need nothing but a file's content."""
+"""Decoders that need only a file's content."""
 
 MODE_WORDS = ("splatrendermode:", "antialiased")
-"""First words of the comments that say how a file is to be drawn."""
+"""First words of comments on compensated opacities."""
 
-REASONS = {"given": "given", "stated": "the file states"}
-"""Why a file's axes are out of doubt."""
+REASONS = {"given": "set", "stated": "the file states"}
+"""Reasons for certain axes, for the log."""
 
 
 def columns_of(gaussians: Gaussians) -> dict[str, Float[Tensor, "N"]]:
-    """Returns properties by name in file order; f_rest is channel-major: all red, then green, then blue."""
+    """Returns properties in file order; f_rest is channel-major: all red, then green, then blue."""
     rest = gaussians.sh_rest.transpose(1, 2).flatten(1)
     zeros = torch.zeros_like(gaussians.opacity_logits)
     columns = dict(zip("xyz", gaussians.means.unbind(1), strict=True))
@@ -60,12 +60,11 @@ class SpzForm:
     """Version and axes of a .spz to write."""
 
     version: int = 3
-    """4: streams of Zstandard, and the axes are stated; 3: what more programs read."""
+    """4: streams of Zstandard and stated axes; 3: more programs read it."""
     axes: str = SPECIFIED
-    """The specification's, rub, or the training world's, rdf."""
+    """rub, of the specification, or rdf, of training worlds."""
 
     def __post_init__(self) -> None:
-        """Raises InputError for what is not written."""
         if self.version not in SPZ_VERSIONS:
             raise InputError(f"the version of SPZ is {self.version!r}: choose {' or '.join(map(str, SPZ_VERSIONS))}")
         if self.axes not in (SPECIFIED, TRAINED):
@@ -80,12 +79,12 @@ def write_gaussians(
     spz: SpzForm = SpzForm(),
     origin: Origin = NO_ORIGIN,
 ) -> None:
-    """Writes a splat file of the kind that its suffix says. compensated: opacities are, when it is drawn; origin: added
-    to positions, in float64.
+    """Writes a splat file of the format of its suffix.
+
+    compensated: opacities are compensated in renders; origin: added to positions in float64.
 
     Raises:
-        InputError: a value is not finite; the property and the number of rows are named. Or the format cannot hold
-            the splats.
+        InputError: a value is not finite, or the format cannot hold the splats.
     """
     suffix = suffix_of(path)
     if suffix in (STANDARD, ""):
@@ -93,7 +92,7 @@ def write_gaussians(
     elif suffix == ".glb":
         write_whole(path, encode_glb(arrays_of(gaussians), comments, origin))
     elif suffix == ".spz":
-        turned = to_training_axes(away(gaussians, origin), spz.axes)  # a turn by 180 degrees goes both ways
+        turned = to_training_axes(away(gaussians, origin), spz.axes)  # a turn by 180 degrees is its own inverse
         write_whole(path, encode_spz(arrays_of(turned), compensated, spz.version, spz.axes))
     elif suffix == ".sog":
         write_whole(path, encode_sog(arrays_of(away(gaussians, origin)), compensated))
@@ -106,8 +105,7 @@ def write_gaussians(
 def write_columns(
     path: Path, values: dict[str, Float[Tensor, "N"]], comments: Sequence[str] = (), origin: Origin = NO_ORIGIN
 ) -> None:
-    """Writes a splat file of any properties. origin: added to x, y and z, which are doubles then; errors as
-    `write_gaussians`."""
+    """Writes a PLY of any properties; origin: added to x, y and z as doubles; errors as `write_gaussians`."""
     columns = {name: value.detach().float().cpu().numpy() for name, value in values.items()}
     for name, value in columns.items():
         bad = int((~np.isfinite(value)).sum())
@@ -124,27 +122,27 @@ class SplatContent:
 
     path: Path
     gaussians: Gaussians
-    """Splats in the axes of training worlds, if the file is in `axes`; means in float64, with its stated origin."""
+    """Splats converted from `axes` to training axes; means in float64, with the stated origin."""
     axes: str
     """Axes of the file's numbers: one of `axis_names.SYSTEMS`."""
     by: str
-    """Reason: given, stated, specified (the format's, which programs do not keep to), conventional (the format's),
-    fixed (glTF's)."""
+    """Source of the axes: a setting, stated in the file, specified (SPZ, not always followed), fixed (glTF), or
+    conventional."""
 
 
 def read_gaussians(path: Path, axes: str = AUTO, origin: Origin = NO_ORIGIN) -> Gaussians:
-    """Reads a splat file of any SH degree, of the format that its first bytes show, and log axes that are in doubt.
+    """Reads a splat file of any format and SH degree, and logs its axes.
 
     axes: one of `axis_names.CHOICES`; origin: subtracted from positions in float64.
 
     Raises:
-        InputError: it is damaged, or lacks a property; or axes are set for a format that fixes them.
+        InputError: it is damaged, lacks a property, or axes are set for a format that fixes them.
     """
     return around(read_in_double(path, axes), origin)
 
 
 def read_around(path: Path, axes: str = AUTO, base: Origin = NO_ORIGIN) -> tuple[Gaussians, Origin]:
-    """Reads a splat file as (Gaussians around an origin of their own, that origin); coordinates count from `base`."""
+    """Reads a splat file as (Gaussians around their own origin, that origin); coordinates relative to `base`."""
     x, y, z = base
     gaussians = away(read_in_double(path, axes), (-x, -y, -z))
     origin = origin_of_positions(gaussians.means)
@@ -152,14 +150,14 @@ def read_around(path: Path, axes: str = AUTO, base: Origin = NO_ORIGIN) -> tuple
 
 
 def read_in_double(path: Path, axes: str = AUTO) -> Gaussians:
-    """Reads a splat file as `read_gaussians`, with means in float64; the origin that a file states is added to them."""
+    """Reads a splat file as `read_gaussians`, with means in float64 and the file's stated origin added."""
     content = read_splats(path, axes)
     log_axes(content)
     return content.gaussians
 
 
 def read_splats(path: Path, axes: str = AUTO) -> SplatContent:
-    """Reads a splat file without a word on its axes; errors as `read_gaussians`."""
+    """Reads a splat file without logging its axes; errors as `read_gaussians`."""
     if axes not in CHOICES:
         raise InputError(f"axes is {axes!r}: choose {EXAMPLES}")
     path = splat_file_at(path)
@@ -176,32 +174,32 @@ def read_splats(path: Path, axes: str = AUTO) -> SplatContent:
     except (OSError, InputError) as problem:
         raise InputError(f"'{path}' cannot be read: {getattr(problem, 'strerror', None) or problem}") from None
     if axes != AUTO and stated not in (None, axes):
-        logger.warning("%s states axes %s, and is read as %s, as given", path, stated, axes)
-    axes, by = (axes, "given") if axes != AUTO else (stated, "stated") if stated else usual_axes(kind)
+        logger.warning("%s states axes %s, using %s from the settings", path, stated, axes)
+    if axes != AUTO:
+        by = "given"
+    elif stated:
+        axes, by = stated, "stated"
+    elif kind == ".spz":
+        axes, by = SPECIFIED, "specified"
+    else:
+        axes, by = TRAINED, FIXED if kind == ".glb" else "conventional"
     return SplatContent(path=path, gaussians=to_training_axes(gaussians, axes), axes=axes, by=by)
 
 
 def kind_of(content: bytes, path: Path) -> str:
-    """Returns which of SUFFIXES a file is; where its name says otherwise, the log does."""
+    """Returns the format of a file, one of SUFFIXES; logs if its name differs."""
     kind = format_of(content[:MOST_HEADER], path)
     if kind != format_of(b"", path):
-        logger.info("%s is read as %s, which its first bytes show", path, kind)
+        logger.info("%s is read as %s, by its first bytes", path, kind)
     return kind
 
 
-def usual_axes(kind: str) -> tuple[str, str]:
-    """Returns (axes of files of one of SUFFIXES that state none, why)."""
-    if kind == ".spz":
-        return SPECIFIED, "specified"
-    return TRAINED, FIXED if kind == ".glb" else "conventional"
-
-
 def log_axes(content: SplatContent) -> None:
-    """Logs the axes that a file is taken to have and the remedy if they are wrong, unless its format fixes them."""
+    """Logs the axes of a file and a remedy if they are wrong, unless its format fixes them."""
     if content.by == "specified":
         logger.info(
-            "%s: axes %s, as SPZ specifies; the file states none. Where it lies upside down or out of view, give axes "
-            "%s (--axes %s, or axes=%s)",
+            "%s: axes %s, as SPZ specifies; the file states none. If it lies upside down or out of view, set axes %s "
+            "(--axes %s, or axes=%s)",
             *(content.path, content.axes, TRAINED, TRAINED, TRAINED),
         )
     elif content.by in REASONS:
@@ -209,7 +207,7 @@ def log_axes(content: SplatContent) -> None:
 
 
 def decode(content: bytes, kind: str, name: str) -> tuple[Gaussians, str | None]:
-    """Returns (splats of a file's content, means in float64; axes that it states, if any).
+    """Returns (splats of a file's content with float64 means, axes that it states or None).
 
     kind: one of SUFFIXES; name: of the file, for the log.
     """
@@ -222,25 +220,22 @@ def decode(content: bytes, kind: str, name: str) -> tuple[Gaussians, str | None]
         return in_double(decode_glb(content, name, Path(name).parent)), None
     if kind == ".sog":
         return in_double(decode_sog(content, Path(name))), None
-    with np.errstate(over="ignore", invalid="ignore"):  # rows that are not finite are left out
+    with np.errstate(over="ignore", invalid="ignore"):  # `finite_rows` drops the rows
         gaussians = in_double(DECODERS[kind](content))
     return Gaussians(**finite_rows(vars(gaussians), name)), None
 
 
 def in_double(arrays: Arrays) -> Gaussians:
-    """Returns Gaussians of arrays, means in float64; those that float32 cannot hold are NaN."""
+    """Returns Gaussians of arrays with float64 means; NaN for those beyond float32."""
     gaussians, means = gaussians_from(arrays), torch.from_numpy(arrays.means)
     return replace(gaussians, means=torch.where(gaussians.means.isfinite(), means, torch.nan))
 
 
 def compensated(path: Path) -> bool:
-    """Returns whether a file says that opacities are compensated when it is drawn, as Mip-Splatting has it.
+    """Returns whether a file states compensated opacities, as of Mip-Splatting; InputError: it cannot be read.
 
-    SPZ has a flag for it, SOG an entry (`sog_is_antialiased`); PLY a comment, `SplatRenderMode: mip` (Brush,
-    SuperSplat) or `antialiased 1` (Postshot), of which the last counts. `.splat` and `.ksplat` do not say.
-
-    Raises:
-        InputError: it cannot be read.
+    SPZ has a flag, SOG an entry (`sog_is_antialiased`), PLY a comment, of which the last counts: `SplatRenderMode: mip`
+    (Brush, SuperSplat) or `antialiased 1` (Postshot). `.splat` and `.ksplat` have none.
     """
     path = splat_file_at(path)
     refuse_lfs_pointer(path)
@@ -265,7 +260,7 @@ def compensated(path: Path) -> bool:
 
 
 def is_linear(path: Path) -> bool:
-    """Returns whether a splat file that can be read has colours of linear light, which became sRGB."""
+    """Returns whether a splat file has colours of linear light, which reading converts to sRGB."""
     with splat_file_at(path).open("rb") as file:
         head = file.read(MOST_HEADER)
         return format_of(head, path) == ".glb" and names_linear(head + file.read())

@@ -1,7 +1,7 @@
 """SPZ, versions 2 to 4: one array an attribute, each number in few bits (Niantic, nianticlabs/spz, MIT).
 
-The specification's axes are x right, y up, z back (RUB); training worlds are x right, y down, z front (RDF). Many
-programs write the training world's axes instead. Only an extension of version 4 says which a file holds.
+The specification's axes are x right, y up, z back (RUB); many programs write those of training worlds instead, x right,
+y down, z front (RDF). Only an extension of version 4 states the axes.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ from gsx.formats.spz_streams import (
 
 FRACTION_BITS = 12
 FURTHEST = 2048 - 2**-FRACTION_BITS
-"""Coordinates that 24 bits hold, scene units."""
+"""Largest coordinate in 24 bits, scene units."""
 COLOUR_SCALE = 0.15
 MOST_COEFFICIENTS = 15
 """Coefficients of degree 3, without the constant one."""
@@ -33,15 +33,13 @@ ROOT_2 = 2**0.5
 
 
 def encode_spz(arrays: Arrays, antialiased: bool = False, version: int = 3, axes: str = SPECIFIED) -> bytes:
-    """Returns a file. antialiased: to be drawn with compensated opacities, as models of Mip-Splatting.
+    """Encodes a file of at least one splat; version 4 states the axes of the arrays.
 
-    axes: which the arrays are in; a file of version 4 states them.
+    antialiased: opacities are compensated in renders, as in models of Mip-Splatting.
 
     Raises:
-        InputError: there are no splats, of too high a degree, or beyond what 24 bits hold; or there is no Zstandard.
+        InputError: positions exceed 24 bits, or Zstandard is missing.
     """
-    if len(arrays.means) == 0:
-        raise InputError("SPZ holds no empty scenes: the model has no splats")
     furthest = float(np.abs(arrays.means).max())
     if furthest > FURTHEST:
         raise InputError(
@@ -61,7 +59,7 @@ def encode_spz(arrays: Arrays, antialiased: bool = False, version: int = 3, axes
 
 
 def packed_arrays(arrays: Arrays) -> list[bytes]:
-    """Returns the bytes of positions, opacities, colours, scales, rotations, coefficients."""
+    """Packs positions, opacities, colours, scales, rotations and coefficients."""
     positions = rounded(arrays.means * 2**FRACTION_BITS).astype("<i4")
     parts = [
         np.ascontiguousarray(positions).view(np.uint8).reshape(-1, 4)[:, :3],
@@ -75,7 +73,7 @@ def packed_arrays(arrays: Arrays) -> list[bytes]:
 
 
 def packed_rotations(quats: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "N 4"]:
-    """Returns 4 bytes a quaternion (w, x, y, z): the three smallest of x, y, z, w by sign and magnitude."""
+    """Packs quaternions (w, x, y, z) in 4 bytes: the three smallest of x, y, z, w by sign and magnitude."""
     largest, three = smallest_three(quats[:, [1, 2, 3, 0]])
     fields = np.floor(511 * np.abs(three) * ROOT_2 + 0.5).clip(0, 511).astype(np.uint32) + 512 * (three < 0)
     words = (largest << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]).astype("<u4")
@@ -88,18 +86,16 @@ def as_bytes(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
 
 
 def coarse(sh_rest: Float[np.ndarray, "N B 3"]) -> UInt8[np.ndarray, "N B 3"]:
-    """Quantises coefficients within [-1, 1], of degree 1 to 5 bits, of higher ones to 4, so that gzip finds less."""
+    """Quantises coefficients in [-1, 1] to 5 bits (degree 1) or 4 bits, for smaller files."""
     steps = np.array([8] * 3 + [16] * 12)[: sh_rest.shape[1], None]
     return as_bytes(np.trunc((rounded(128 * sh_rest) + 128 + steps / 2) / steps) * steps)
 
 
 def decode_spz(content: bytes) -> tuple[Arrays, str | None]:
-    """Returns (splats of a file of version 2, 3 or 4 in its own axes, the axes that it states, if any).
-
-    Bands beyond degree 3 are left out.
+    """Returns (splats of a file in its own axes up to degree 3, axes that it states or None).
 
     Raises:
-        InputError: it is damaged, or of another version.
+        InputError: it is damaged, or not of version 2, 3 or 4.
     """
     file = read_content(content)
     count, sizes = file.header.splats, file.header.sizes()
@@ -116,14 +112,14 @@ def decode_spz(content: bytes) -> tuple[Arrays, str | None]:
 
 
 def positions_of(packed: UInt8[np.ndarray, "N 9"]) -> Int[np.ndarray, "N 3"]:
-    """Returns whole numbers of 24 bits with their signs."""
+    """Unpacks signed integers of 24 bits."""
     words = np.zeros((len(packed), 3, 4), np.uint8)
     words[..., 1:] = packed.reshape(-1, 3, 3)
     return words.reshape(-1, 12).view("<i4") >> 8
 
 
 def is_antialiased(head: bytes) -> bool:
-    """Returns whether the header says that opacities are compensated; False for what is no SPZ."""
+    """Returns whether the header states compensated opacities; False for other files."""
     try:
         header = head if head[:4] == MAGIC else unzipped(head, HEADER.size)
     except InputError:

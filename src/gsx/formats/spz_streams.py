@@ -1,4 +1,4 @@
-"""Containers of SPZ: what stands around the arrays in versions 2 and 3 (one gzip stream) and 4 (streams of Zstandard).
+"""Containers of SPZ: one gzip stream (versions 2 and 3), or streams of Zstandard (version 4).
 
 Source: nianticlabs/spz, load-spz.cc and extensions/README.md (MIT), revision 21715c3. Damaged content raises
 InputError, which calls the file "it".
@@ -17,7 +17,7 @@ from gsx.formats.zstd import compress, decompress
 
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")
-"""Magic, version, count, degree, fraction bits, flags, and of version 4 the number of streams."""
+"""Magic, version, count, degree, fraction bits, flags, number of streams (version 4)."""
 STREAMED_HEADER = 32
 TABLE, ENTRY, RECORD = struct.Struct("<I"), struct.Struct("<QQ"), struct.Struct("<II")
 ANTIALIASED, EXTENDED = 1, 2
@@ -28,28 +28,25 @@ COORDINATE_SYSTEM = 0xADBE0003
 SMALLEST_THREE, STREAMED = 3, 4
 """First versions with quaternions of 4 bytes, and with streams of Zstandard."""
 POSITION_BYTES, MOST_RATIO = 9, 1024
-"""Bytes of a position, and the ratio of all positions to the file from which on it is refused (the library's bound)."""
+"""Bytes of a position, and largest ratio of all positions to the file (the library's bound)."""
 MOST_EXTENSION_BYTES = 1 << 16
-"""Bytes of extensions in versions 2 and 3, where they follow the arrays."""
+"""Most bytes of extensions after the arrays in versions 2 and 3."""
 MOST_FRACTION_BITS = 23
 
 
 class Header(NamedTuple):
-    """First 16 bytes of a file, or of its gzip stream, after the magic."""
+    """Fields of HEADER after the magic."""
 
     version: int
     splats: int
-    """Number of splats."""
     degree: int
-    """Degree of the spherical harmonics, 0 to 4."""
     fraction_bits: int
     """Bits of positions after the point."""
     flags: int
     streams: int = 0
-    """Number of streams in version 4; 0 before."""
 
     def sizes(self) -> list[int]:
-        """Returns bytes a splat of positions, opacities, colours, scales, rotations, coefficients."""
+        """Returns the bytes per splat of positions, opacities, colours, scales, rotations and coefficients."""
         return [POSITION_BYTES, 1, 3, 3, 4 if self.version >= SMALLEST_THREE else 3, 3 * COEFFICIENTS[self.degree]]
 
     def packed(self) -> bytes:
@@ -59,30 +56,29 @@ class Header(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Content:
-    """A file without its compression."""
+    """An uncompressed file."""
 
     header: Header
     arrays: Sequence[bytes]
-    """Bytes of the arrays in the order of `Header.sizes`."""
+    """Arrays in the order of `Header.sizes`."""
     axes: str | None
-    """Axes that the file states; None: it states none."""
+    """Axes that the file states, if any."""
 
 
 def read_content(content: bytes) -> Content:
-    """Reads a file of version 2, 3 or 4.
-
-    Raises:
-        InputError: it is damaged, of another version, or no SPZ.
-    """
+    """Reads a file; InputError: it is damaged, or no SPZ of version 2, 3 or 4."""
     return streamed_content(content) if content[:4] == MAGIC else gzipped_content(content)
 
 
 def header_of(data: bytes, size: int) -> Header:
-    """Reads a header; `size`: bytes of the file, compressed."""
+    """Reads a header; `size`: bytes of the compressed file."""
     if len(data) < HEADER.size or data[:4] != MAGIC:
         raise InputError("it is no SPZ, or ends within its header: export it anew")
     header = Header(*HEADER.unpack_from(data)[1:])
-    refuse_version(header.version)
+    if header.version == 1:
+        raise InputError("it is SPZ version 1, which was never published, gsx reads 2, 3 and 4: export it anew")
+    if header.version not in (2, 3, STREAMED):
+        raise InputError(f"it is SPZ version {header.version}, gsx reads 2, 3 and 4: export it as version 4")
     if header.degree >= len(COEFFICIENTS) or header.fraction_bits > MOST_FRACTION_BITS:
         raise InputError(
             f"it is damaged: its header says degree {header.degree} and {header.fraction_bits} fraction bits of "
@@ -91,14 +87,6 @@ def header_of(data: bytes, size: int) -> Header:
     if header.splats * POSITION_BYTES > size * MOST_RATIO:
         raise InputError(f"its {size:,} bytes cannot hold {header.splats:,} splats, as it says: copy or export it anew")
     return header
-
-
-def refuse_version(version: int) -> None:
-    """Raises InputError for a version that is not read."""
-    if version == 1:
-        raise InputError("it is SPZ version 1, which was never published, gsx reads 2, 3 and 4: export it anew")
-    if version not in (2, 3, STREAMED):
-        raise InputError(f"it is SPZ version {version}, gsx reads 2, 3 and 4: export it as version 4")
 
 
 # -- versions 2 and 3 --------------------------------------------------------------------------------------------------
@@ -118,7 +106,7 @@ def gzipped_content(content: bytes) -> Content:
 
 
 def unzipped(content: bytes, most: int) -> bytes:
-    """Returns so many bytes of a gzip stream, or all that it has."""
+    """Decompresses at most `most` bytes of a gzip stream."""
     try:
         return zlib.decompressobj(wbits=31).decompress(content, most)
     except zlib.error as error:
@@ -126,7 +114,7 @@ def unzipped(content: bytes, most: int) -> bytes:
 
 
 def split(data: bytes, sizes: Sequence[int]) -> tuple[list[bytes], bytes]:
-    """Returns (parts of these sizes, what follows them)."""
+    """Returns (parts of these sizes, the rest)."""
     parts, begin = [], 0
     for size in sizes:
         parts.append(data[begin : begin + size])
@@ -135,7 +123,7 @@ def split(data: bytes, sizes: Sequence[int]) -> tuple[list[bytes], bytes]:
 
 
 def gzipped(header: Header, arrays: Sequence[bytes]) -> bytes:
-    """Returns a file of version 2 or 3."""
+    """Packs a file of version 2 or 3."""
     return gzip.compress(header.packed() + b"".join(arrays), mtime=0)
 
 
@@ -143,7 +131,7 @@ def gzipped(header: Header, arrays: Sequence[bytes]) -> bytes:
 
 
 def streamed_content(content: bytes) -> Content:
-    """Reads a file that begins with its header; errors as `read_content`."""
+    """Reads a file of version 4; errors as `read_content`."""
     header = header_of(content, len(content))
     if header.version < STREAMED:
         raise InputError(f"it is the content of SPZ version {header.version} without its gzip stream: gzip it")
@@ -158,7 +146,7 @@ def streamed_content(content: bytes) -> Content:
 
 
 def table_entries(content: bytes, table: int, header: Header, sizes: Sequence[int]) -> list[tuple[bytes, int]]:
-    """Returns (compressed bytes, size) of each stream; `table`: where their table begins."""
+    """Returns (compressed bytes, size) of each stream; `table`: byte at which their table begins."""
     begin = table + len(sizes) * ENTRY.size
     if header.streams != len(sizes) or table < STREAMED_HEADER or begin > len(content):
         raise InputError(
@@ -176,7 +164,7 @@ def table_entries(content: bytes, table: int, header: Header, sizes: Sequence[in
 
 
 def streamed(header: Header, arrays: Sequence[bytes], axes: str) -> bytes:
-    """Returns a file of version 4 that states its axes."""
+    """Packs a file of version 4 that states its axes."""
     parts = [part for part in arrays if part]
     streams = [compress(part) for part in parts]
     record = RECORD.pack(COORDINATE_SYSTEM, TABLE.size) + TABLE.pack(SYSTEMS.index(axes) + 1)
@@ -189,7 +177,7 @@ def streamed(header: Header, arrays: Sequence[bytes], axes: str) -> bytes:
 
 
 def records_of(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Iterates over (type, payload) of extensions, up to one that is cut off."""
+    """Yields (type, payload) of complete extensions."""
     while len(data) >= RECORD.size:
         kind, size = RECORD.unpack_from(data)
         payload, data = data[RECORD.size : RECORD.size + size], data[RECORD.size + size :]
@@ -198,7 +186,7 @@ def records_of(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def stated_axes(records: bytes) -> str | None:
-    """Returns the axes that extensions state; None: they state none, or number 0, which means none."""
+    """Returns the axes that extensions state, if any; number 0 means none."""
     for kind, payload in records_of(records):
         if kind == COORDINATE_SYSTEM and len(payload) >= TABLE.size:
             (number,) = TABLE.unpack_from(payload)

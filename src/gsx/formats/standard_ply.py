@@ -1,8 +1,7 @@
-"""The standard PLY of 3D-GS, and the forms in which other programs write it; properties count by name.
+"""Reading of the standard PLY of 3D-GS and its variants by other programs.
 
-Colours may be display RGB (nerfstudio), an opacity may be an alpha channel, bands beyond degree 3 are left out. A 3D
-filter next to the scales is fused (Mip-Splatting, training). Rows that are not finite are left out, as by viewers.
-Other content raises InputError, which calls the file "it".
+Colours may be display RGB (nerfstudio), opacity an alpha channel; a 3D filter column is fused (Mip-Splatting). Bands
+beyond degree 3, and rows with NaN or inf, are dropped. Other content raises InputError, which calls the file "it".
 """
 
 import logging
@@ -25,7 +24,7 @@ from gsx.formats.smoothing import smoothed_raw
 logger = logging.getLogger(__name__)
 
 MOST_LOGIT = 30.0
-"""Logit in place of an infinite one, of opacities 0 and 1."""
+"""Logit in place of infinity (opacities 0 and 1)."""
 MOST_COEFFICIENTS = 15
 """Coefficients of degree 3, without the constant one."""
 Columns = Mapping[str, np.ndarray]
@@ -39,18 +38,14 @@ FORMS = {
     ("motion_0",): "holds splats that move: export one moment of them",
     ("packed_position",): "holds packed splats without their chunks: export it anew as compressed PLY",
 }
-"""Forms of files that lack a property of splats, by properties that only they have."""
+"""Descriptions of files without splats, by properties that identify them."""
 ANCHORS = ("f_anchor_feat_0", "f_offset_0")
-"""Properties that no file of splats has."""
+"""Properties of anchors, which no file of splats has."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # rows with NaN of any kind, or beyond float32, are left out
+@np.errstate(over="ignore", invalid="ignore")  # `finite_rows` drops the rows
 def decode_standard_ply(content: bytes, name: str) -> Gaussians:
-    """Returns the splats of a file's content, means in float64. name: of the file, for the log.
-
-    Raises:
-        InputError: it is damaged, or holds no splats of 3D-GS.
-    """
+    """Decodes a file's content, means in float64; InputError: it is damaged, or no splats. name: of the file."""
     columns = vertices_of(content)
     if problem := problem_of(columns, content):
         raise InputError(problem)
@@ -65,20 +60,16 @@ def decode_standard_ply(content: bytes, name: str) -> Gaussians:
     if "filter_3D" in columns:
         drawn = smoothed_raw(raw["log_scales"], raw["opacity_logits"], float_column(columns, "filter_3D"))
         raw |= dict(zip(("log_scales", "opacity_logits"), drawn, strict=True))
-    raw["means"] = torch.where(raw["means"].isfinite(), in_double(columns), torch.nan)
+    means = torch.from_numpy(np.stack([columns[axis].astype(float) for axis in "xyz"], 1))
+    raw["means"] = torch.where(raw["means"].isfinite(), means, torch.nan)
     gaussians = Gaussians(**finite_rows(raw, name))
     for sentence in activated_words(gaussians):
         logger.warning("%s: %s", name, sentence)
     return gaussians
 
 
-def in_double(columns: Columns) -> Float[Tensor, "N 3"]:
-    """Returns positions as a file has them."""
-    return torch.from_numpy(np.stack([columns[axis].astype(float) for axis in "xyz"], 1))
-
-
 def problem_of(columns: Columns, content: bytes) -> str:
-    """Returns why vertices are no splats of 3D-GS, in words; empty: they are."""
+    """Returns why vertices are no splats of 3D-GS; empty: they are."""
     needed = ["x", "y", "z", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     missing = [f"'{name}'" for name in needed if name not in columns]
     if not {"opacity", "alpha"} & columns.keys():
@@ -91,7 +82,7 @@ def problem_of(columns: Columns, content: bytes) -> str:
 
 
 def form_of(columns: Columns, content: bytes) -> str:
-    """Returns what vertices that are no splats probably are, and a remedy."""
+    """Describes vertices that are no splats, with a remedy."""
     for names, form in FORMS.items():
         if set(names) <= columns.keys():
             return form
@@ -107,49 +98,47 @@ def form_of(columns: Columns, content: bytes) -> str:
 
 
 def float_column(columns: Columns, name: str) -> Float[Tensor, "N"]:
-    """Returns a property as float32; doubles beyond it become infinite."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return torch.from_numpy(columns[name].astype(np.float32))
+    """Returns a property as float32; large doubles become infinite."""
+    return torch.from_numpy(columns[name].astype(np.float32))
 
 
 def stacked(columns: Columns, *names: str) -> Float[Tensor, "N k"]:
-    """Returns properties side by side."""
+    """Stacks properties as columns."""
     return torch.stack([float_column(columns, name) for name in names], 1)
 
 
 def opacity_logits(columns: Columns, file: str) -> Float[Tensor, "N"]:
-    """Returns logits of opacities: as stored, or of an alpha channel of any unit."""
+    """Returns logits of opacities, as stored or from an alpha channel of any unit."""
     if "opacity" in columns:
         return float_column(columns, "opacity").nan_to_num(torch.nan, MOST_LOGIT, -MOST_LOGIT)
     alpha = scaled_by(columns["alpha"], "alpha").clamp(SMALLEST_OPACITY, 1 - SMALLEST_OPACITY)
-    logger.warning("%s: property opacity is missing, alpha is taken for it", file)
+    logger.warning("%s: property opacity is missing, using alpha", file)
     return alpha.logit()
 
 
 def constant_band(columns: Columns) -> Float[Tensor, "N 3"]:
-    """Returns coefficients of the constant band: as stored, or of display RGB."""
+    """Returns coefficients of the constant band, as stored or from display RGB."""
     if "f_dc_0" in columns:
         missing = [name for name in ("f_dc_1", "f_dc_2") if name not in columns]
         if missing:
             raise InputError(f"it lacks property '{missing[0]}': export it anew as PLY")
         return stacked(columns, "f_dc_0", "f_dc_1", "f_dc_2")
     colours = colours_among(columns)
-    assert colours is not None  # problem_of has looked
+    assert colours is not None  # `problem_of` checks it
     return constant_from_colour(scaled_by(colours, "/".join(COLOUR_NAMES[0])))
 
 
 def scaled_by(values: np.ndarray, name: str) -> Float[Tensor, "..."]:
-    """Returns intensities as shares of full intensity."""
+    """Scales intensities of any unit to [0, 1]."""
     full = full_scale_of(values)
     if full is None:
         ends = f"{np.nanmin(values):g} to {np.nanmax(values):g}"
         raise InputError(f"its {name} from {ends} are of no known unit: export bytes, or floats in [0, 1]")
-    with np.errstate(over="ignore", invalid="ignore"):
-        return torch.from_numpy(values.astype(np.float32)) / full
+    return torch.from_numpy(values.astype(np.float32)) / full
 
 
 def higher_bands(columns: Columns) -> Float[Tensor, "N B 3"]:
-    """Returns coefficients next to the constant one, up to degree 3; f_rest is channel-major."""
+    """Returns coefficients of the other bands up to degree 3; f_rest is channel-major."""
     count = sum(name.startswith("f_rest_") for name in columns)
     if count not in (3 * ((degree + 1) ** 2 - 1) for degree in range(5)):
         raise InputError(f"it has {count} f_rest properties, degrees 0 to 4 have 0, 9, 24, 45 or 72: export it anew")

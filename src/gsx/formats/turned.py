@@ -1,4 +1,6 @@
-"""Gaussians in a frame that is turned: positions, orientations, and colours that depend on the direction."""
+"""Rotations of Gaussians: positions, orientations and view-dependent colours."""
+
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -9,30 +11,24 @@ from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float
 
 DIRECTIONS = 200
-"""At which a turned function of the sphere is sampled: many more than it has coefficients."""
+"""Samples on the sphere, many more than coefficients."""
 
 
 def turned(gaussians: Gaussians, rotation: Float[Tensor, "3 3"]) -> Gaussians:
-    """The same Gaussians where every point p is `rotation` p."""
+    """Maps every point p of Gaussians to `rotation` p."""
     rotation = rotation.double()
     quats = product(quaternions_of(rotation[None])[0], torch.nn.functional.normalize(gaussians.quats.double(), dim=1))
     rest = gaussians.sh_rest
     if rest.shape[1]:
         rest = (turned_harmonics(rotation, degree_of(rest.shape[1])) @ rest.double()).to(rest)
-    return Gaussians(
-        means=(gaussians.means.double() @ rotation.T).to(gaussians.means),
-        log_scales=gaussians.log_scales,
-        quats=quats.to(gaussians.quats),
-        opacity_logits=gaussians.opacity_logits,
-        sh_dc=gaussians.sh_dc,
-        sh_rest=rest,
-    )
+    means = (gaussians.means.double() @ rotation.T).to(gaussians.means)
+    return replace(gaussians, means=means, quats=quats.to(gaussians.quats), sh_rest=rest)
 
 
 def turned_harmonics(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "B B"]:
-    """M with Y(d) M c = Y(rotation^T d) c for all directions d and coefficients c.
+    """Returns M with Y(d) M c = Y(rotation^T d) c for all directions d and coefficients c.
 
-    Bands turn within themselves (Wigner), so that a least-squares fit over many directions is exact.
+    A least-squares fit over many directions is exact, as bands do not mix (Wigner).
     """
     directions = spread_directions(DIRECTIONS)
     rotated = harmonics(directions @ rotation, degree)
@@ -40,14 +36,14 @@ def turned_harmonics(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tenso
 
 
 def spread_directions(count: int) -> Float[Tensor, "count 3"]:
-    """Unit vectors spread evenly over the sphere (a Fibonacci lattice), float64."""
+    """Returns unit vectors evenly over the sphere, float64 (a Fibonacci lattice)."""
     step = torch.arange(count, dtype=torch.float64) + 0.5
     z, angle = 1 - 2 * step / count, torch.pi * (1 + 5**0.5) * step
     return torch.stack([(1 - z * z).sqrt() * angle.cos(), (1 - z * z).sqrt() * angle.sin(), z], 1)
 
 
 def product(a: Float[Tensor, "4"], b: Float[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
-    """The rotation b followed by a, as quaternions (w, x, y, z)."""
+    """Returns the rotation b followed by a, as quaternions (w, x, y, z)."""
     w, x, y, z = a.unbind()
     left = torch.stack([torch.stack([w, -x, -y, -z]), torch.stack([x, w, -z, y]), torch.stack([y, z, w, -x]),
                         torch.stack([z, -y, x, w])])  # fmt: skip
@@ -55,13 +51,13 @@ def product(a: Float[Tensor, "4"], b: Float[Tensor, "N 4"]) -> Float[Tensor, "N 
 
 
 def cross_matrix(a: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The matrix that makes b into a x b."""
+    """Returns the matrix that maps b to a x b."""
     zero, (x, y, z) = a.new_zeros(()), a.unbind()
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
 
 
 def rotation_between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The smallest rotation that takes unit vector a to unit vector b, float64."""
+    """Returns the smallest rotation from unit vector a to unit vector b, float64."""
     a, b = a.double(), b.double()
     axis, cosine = torch.linalg.cross(a, b), float(a @ b)
     if cosine < -1 + 1e-9:  # a half turn about any axis across a

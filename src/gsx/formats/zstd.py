@@ -1,4 +1,4 @@
-"""Zstandard streams: by Python's own module from 3.14 on, by the package zstandard before."""
+"""Zstandard streams, by Python's module (3.14 and later) or the package zstandard."""
 
 from importlib import import_module
 from io import BytesIO
@@ -9,11 +9,11 @@ from gsx.core.errors import InputError
 LEVEL = 12
 """Level of compression, as in Niantic's library."""
 PIECE = 1 << 20
-"""Bytes that are decompressed at a time: no claim of a stream's header is believed."""
+"""Bytes decompressed at a time: a stream's header may state any size."""
 
 
 def zstd_module() -> Any:
-    """Returns the module that there is."""
+    """Returns the installed module; InputError: there is none."""
     for name in ("compression.zstd", "zstandard"):
         try:
             return import_module(name)
@@ -23,7 +23,7 @@ def zstd_module() -> Any:
 
 
 def compress(data: bytes) -> bytes:
-    """Returns one frame."""
+    """Compresses data to one frame."""
     module = zstd_module()
     if hasattr(module, "ZstdFile"):
         return bytes(module.compress(data, level=LEVEL))
@@ -31,23 +31,18 @@ def compress(data: bytes) -> bytes:
 
 
 def decompress(data: bytes, size: int) -> bytes:
-    """Returns the `size` bytes of a stream."""
+    """Decompresses a stream of `size` bytes; InputError: it is damaged, or has another size."""
     module = zstd_module()
     try:
-        with opened(module, data) as stream:
+        plain = hasattr(module, "ZstdFile")
+        opened = module.ZstdFile(BytesIO(data)) if plain else module.ZstdDecompressor().stream_reader(data)
+        with opened as stream:
             pieces, left = [], size
             while left and (piece := stream.read(min(left, PIECE))):
                 pieces.append(piece)
                 left -= len(piece)
             if left or stream.read(1):
-                raise InputError(f"a Zstandard stream has not the {size:,} bytes it should: copy or export it anew")
+                raise InputError(f"a Zstandard stream does not have {size:,} bytes: copy or export it anew")
     except (module.ZstdError, EOFError) as error:
         raise InputError(f"a Zstandard stream is damaged ({error}): copy or export it anew") from None
     return b"".join(pieces)
-
-
-def opened(module: Any, data: bytes) -> Any:
-    """Returns a file object that decompresses."""
-    if hasattr(module, "ZstdFile"):
-        return module.ZstdFile(BytesIO(data))
-    return module.ZstdDecompressor().stream_reader(data)
