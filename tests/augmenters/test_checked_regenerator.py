@@ -257,9 +257,9 @@ def test_samples_of_other_sizes_are_dropped_as_one_of_that_size_is() -> None:
 @pytest.mark.parametrize(
     ("returned", "told"),
     [
-        (lambda asked: [one.image for one in asked][1:], "was asked for 2 pictures and returned 1: it is to return"),
-        (lambda asked: None, "returned NoneType: it is to return a tensor"),
-        (lambda asked: [one.image.numpy() for one in asked], "returned ndarray among them: it is to return a tensor"),
+        (lambda asked: [one.image for one in asked][1:], "got 2 requests and returned 1: return a tensor"),
+        (lambda asked: None, "returned NoneType: return a tensor"),
+        (lambda asked: [one.image.numpy() for one in asked], "returned ndarray among them: return a tensor"),
     ],
 )
 def test_what_is_no_picture_for_each_request_is_told_with_the_regenerator(

@@ -638,7 +638,7 @@ def test_a_longer_run_waits_for_its_next_event(tmp_path: Path, caplog: pytest.Lo
     assert augmenter_of(run).events == [16, 19, 22, 25]
     execute(run, settings, plugins())
     assert run.complete
-    assert "rests until its next event" in caplog.text
+    assert "the run became longer, no pseudo views until the next event" in caplog.text
 
 
 def test_before_the_first_window_a_run_is_that_of_the_control(tmp_path: Path) -> None:

@@ -9,30 +9,26 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.window import Window
 from gsx.core.shapes import Float
 
-WINDOWS = ("center", "random", "grid", "error")
-NOISES = ("uniform", "normal")
-KEPT = ("t", "center")
-
 
 def window_size(width: int, height: int, narrow: float, scale: int) -> tuple[int, int]:
-    """(width, height) of the window that is seen `scale` times as finely on `narrow` times the raster, px."""
+    """Returns (width, height) of the window that `narrow` times the raster shows at `scale`, px."""
     return max(1, round(width * narrow / scale)), max(1, round(height * narrow / scale))
 
 
 def centred_window(width: int, height: int, size: tuple[int, int]) -> Window:
-    """In the middle; half a pixel up and left of it where that is between pixels."""
+    """Returns the window in the middle, rounded to the upper left."""
     return Window(left=(width - size[0]) // 2, top=(height - size[1]) // 2, width=size[0], height=size[1])
 
 
 def random_window(width: int, height: int, size: tuple[int, int], generator: torch.Generator) -> Window:
-    """Anywhere on the raster, all places alike."""
+    """Draws a window anywhere on the raster, uniformly."""
     left, top = (int(torch.randint(whole - part + 1, (), generator=generator)) for whole, part in
                  ((width, size[0]), (height, size[1])))  # fmt: skip
     return Window(left=left, top=top, width=size[0], height=size[1])
 
 
 def grid_window(width: int, height: int, size: tuple[int, int], turn: int) -> Window:
-    """The `turn`-th of the windows that cover the raster in rows, from the start again after the last."""
+    """Returns the `turn`-th of the windows that cover the raster in rows, cyclically."""
     across, down = -(-width // size[0]), -(-height // size[1])
     row, column = divmod(turn % (across * down), across)
     left = round(column * (width - size[0]) / max(1, across - 1))
@@ -41,7 +37,7 @@ def grid_window(width: int, height: int, size: tuple[int, int], turn: int) -> Wi
 
 
 def worst_window(error: Float[Tensor, "H W"], size: tuple[int, int]) -> Window:
-    """Where the mean error is largest."""
+    """Returns the window with the largest mean error."""
     sums = torch.nn.functional.pad(error.double(), (1, 0, 1, 0)).cumsum(0).cumsum(1)
     width, height = size
     windows = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
@@ -50,23 +46,23 @@ def worst_window(error: Float[Tensor, "H W"], size: tuple[int, int]) -> Window:
 
 
 def polar(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """The rotation nearest to a matrix: U diag(1, 1, det U V^T) V^T of its singular value decomposition."""
+    """Returns the rotation nearest to a matrix: U diag(1, 1, det U V^T) V^T of its SVD."""
     left, _, right = torch.linalg.svd(matrix)
     signs = torch.tensor([1.0, 1.0, float(torch.linalg.det(left @ right))], dtype=matrix.dtype)
     return left @ torch.diag(signs) @ right
 
 
 def noise(shape: tuple[int, ...], kind: str, scale: float, generator: torch.Generator) -> Float[Tensor, "*shape"]:
-    """Independent numbers, uniform in [-scale, scale] or normal with that standard deviation; float64."""
+    """Draws float64 numbers, uniform in [-scale, scale] or normal with standard deviation `scale`."""
     if kind == "normal":
         return scale * torch.randn(shape, generator=generator, dtype=torch.float64)
     return scale * (2 * torch.rand(shape, generator=generator, dtype=torch.float64) - 1)
 
 
 def moved(camera: Camera, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"], kept: str = "t") -> Camera:
-    """The camera with noise added to its pose, R' = polar(R + e_R), t' = t + e_t (the paper, Implementation details).
+    """Adds noise to a pose: R' = polar(R + e_R), t' = t + e_t (the paper, Implementation details).
 
-    With `kept` = t the centre swings around the world's origin with the rotation; with center it stays, but for e_t.
+    `kept` = t: the rotation moves the centre around the world's origin; center: the centre moves by e_t only.
     """
     turned = polar(camera.rotation.double() + rotation)
     held = camera.translation.double() if kept == "t" else -turned @ camera.centre.double()

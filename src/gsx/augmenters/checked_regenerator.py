@@ -1,4 +1,4 @@
-"""Regenerators as augmenters use them: results are corrected, checked and counted."""
+"""Regenerators of augmenters: results are corrected, checked and counted."""
 
 import logging
 from collections import Counter
@@ -22,43 +22,43 @@ from gsx.core.training.run import Run
 logger = logging.getLogger(__name__)
 
 MOST_DROPPED = 0.5
-"""Losing more than this share of the pictures at one scale is an error."""
+"""Largest share of dropped pictures at one scale."""
 FEWEST = 8
-"""Pictures that are awaited before that is an error, where they are requested a few at a time."""
+"""Least pictures before that share is an error, for requests of a few pictures at a time."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Redrawn:
-    """What became of a request."""
+    """Result of a request."""
 
     scale: int
     image: Float[Tensor, "3 H W"] | None
-    """Values may lie beyond [0, 1]; None: it is dropped."""
+    """Values may lie beyond [0, 1]; None: dropped."""
     problem: str = ""
-    """Why it is dropped."""
+    """Reason for dropping it."""
     warnings: dict[str, str] = field(default_factory=dict)
-    """Violations of a picture that is kept, by check."""
+    """Violations of a kept picture, by check."""
 
 
 @dataclass(eq=False, kw_only=True)
 class Tally:
-    """Counts of the pictures that an augmenter requested and lost."""
+    """Counts of an augmenter's requested and dropped pictures."""
 
     name: str
-    """Of the augmenter."""
+    """Name of the augmenter."""
     remedies: list[str] = field(default_factory=list)
-    """What helps where too many are lost."""
+    """Remedies for too many dropped pictures."""
     pending: list[Redrawn] = field(default_factory=list)
-    """Requests that are in no account yet; without their pictures."""
+    """Results that no account includes yet, without their pictures."""
     latest: dict[str, Any] = field(default_factory=dict)
     """The last account."""
     requested: Counter[str] = field(default_factory=Counter)
     """All requests so far, by scale."""
     dropped: Counter[str] = field(default_factory=Counter)
-    """Those of them that were dropped."""
+    """Dropped pictures so far, by scale."""
 
     def recall(self, accounts: Sequence[Mapping[str, Any]]) -> None:
-        """Counts what a run requested before it was interrupted."""
+        """Adds the accounts of a run before its interruption."""
         for account in accounts:
             self.requested.update(account["asked"])
             self.dropped.update(account["dropped"])
@@ -67,10 +67,10 @@ class Tally:
         """Counts pending requests, dropped ones and warnings by scale, and logs the losses.
 
         Args:
-            whole: they are all of an event; otherwise losses are compared with those of the run.
+            whole: they are all of an event; otherwise the losses of the run count.
 
         Raises:
-            TrainingError: more than half of the pictures of a scale could not be used.
+            TrainingError: more than half of the pictures of a scale were dropped.
         """
         redrawn, self.pending = self.pending, []
         requested, dropped = by_scale(redrawn), by_scale([one for one in redrawn if one.problem])
@@ -89,7 +89,7 @@ class Tally:
         return self.latest
 
     def warned(self, redrawn: Sequence[Redrawn]) -> dict[str, dict[str, int]]:
-        """Counts pictures that are kept although a check warns of them, by check and scale."""
+        """Counts kept pictures with warnings, by check and scale."""
         counts: dict[str, dict[str, int]] = {}
         for check in dict.fromkeys(check for one in redrawn for check in one.warnings):
             strays = [one for one in redrawn if check in one.warnings]
@@ -99,18 +99,14 @@ class Tally:
         return counts
 
     def account_at(self, step: int) -> dict[str, Any]:
-        """Returns the account of the pictures requested at a step; empty where there were none.
-
-        Raises:
-            TrainingError: more than half of the pictures of a scale could not be used, over the run.
-        """
+        """Returns the account of the pictures requested at a step, empty without any; errors as `account`."""
         if self.pending:
             self.account(step - 1, whole=False)
         return self.latest if self.latest.get("event") == step - 1 else {}
 
 
 def by_scale(redrawn: Sequence[Redrawn]) -> dict[str, int]:
-    """Counts requests at each scale; keys as JSON has them."""
+    """Counts requests by scale; keys are strings, as in JSON."""
     counts = Counter(one.scale for one in redrawn)
     return {str(scale): counts[scale] for scale in sorted(counts)}
 
@@ -125,18 +121,18 @@ class CheckedRegenerator:
 
     @classmethod
     def of_role(cls, context: AugmenterContext, role: str, checks: Checks | None = None) -> "CheckedRegenerator":
-        """Wraps the regenerator of a role; checks: the augmenter's, None: those of the role."""
+        """Wraps the regenerator of a role; checks: None for those of the role."""
         limits = f"checks.{role}" if checks is None else f"augmenter.{context.name}.checks"
         tally = Tally(name=context.name, remedies=[f"choose another regenerator/{role}", f"loosen {limits}"])
         return cls(inner=context.regenerator(role), checks=checks or context.checks[role], tally=tally)
 
     def refuse(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
-        """Raises ConfigError or InputError before training if the regenerator cannot redraw these (`Checkable`)."""
+        """Raises ConfigError or InputError if the regenerator cannot redraw these views (`Checkable`)."""
         if isinstance(self.inner, Checkable):
             self.inner.check(views, scales, moved)
 
     def prepare(self, run: Run, context: AugmenterContext) -> dict[str, float]:
-        """Lets the regenerator learn from training views and the model at every event; returns figures for the log."""
+        """Prepares the regenerator for an event with training views and the model; returns figures for the log."""
         return self.inner.prepare(
             RegeneratorContext(
                 views=run.train_views,
@@ -155,23 +151,22 @@ class CheckedRegenerator:
         """Redraws, corrects and checks pictures, in order.
 
         Args:
-            samples: results whose mean counts.
-            project: whether enlarged pictures are moved to the nearest one that reduces to the request's.
+            samples: number of results to average.
+            project: move enlarged pictures to the nearest one that reduces to the request's.
         """
-        results = [self.regenerate([copy_for_sample(one, n) for one in requests]) for n in range(samples)]
+        results = []
+        for sample in range(samples):  # copies, as a regenerator may write into its pictures
+            copies = [replace(one, seed=one.seed + sample, image=one.image.clone()) for one in requests]
+            results.append(self.regenerate(copies))
         redrawn = [self.checked(request, of_one, project) for request, *of_one in zip(requests, *results, strict=True)]
         self.tally.pending += [replace(one, image=None) for one in redrawn]
         return redrawn
 
     def regenerate(self, requests: Sequence[Request]) -> list[Tensor]:
-        """Calls the regenerator.
-
-        Raises:
-            TrainingError: it does not return a picture for each request.
-        """
+        """Calls the regenerator; TrainingError: it does not return a picture for each request."""
         returned: Any = self.inner.regenerate(requests)
-        message = f"{type(self.inner).__name__}.regenerate was asked for {len(requests)} pictures and returned"
-        remedy = "it is to return a tensor [3, h, w] for each, in order"
+        message = f"{type(self.inner).__name__}.regenerate got {len(requests)} requests and returned"
+        remedy = "return a tensor [3, h, w] for each, in order"
         if not isinstance(returned, Iterable):
             raise TrainingError(f"{message} {type(returned).__name__}: {remedy}")
         pictures = list(returned)
@@ -182,7 +177,7 @@ class CheckedRegenerator:
         return pictures
 
     def checked(self, request: Request, results: Sequence[Tensor], project: bool) -> Redrawn:
-        """Takes the mean of the results, corrects its colour, and drops it if a check says so."""
+        """Averages the results, corrects the colour, and drops the picture if a check fails."""
         name, scale = request.view.name, request.scale
         if defects := [text for one in results if (text := defect(request, one))]:
             return Redrawn(scale=scale, image=None, problem=f"{name}: {defects[0]}")
@@ -196,13 +191,8 @@ class CheckedRegenerator:
         return Redrawn(scale=scale, image=result, warnings={check: f"{name}: {text}" for check, text in beyond.items()})
 
 
-def copy_for_sample(request: Request, sample: int) -> Request:
-    """Copies a request with the seed of a sample; a regenerator may write into its picture."""
-    return replace(request, seed=request.seed + sample, image=request.image.clone())
-
-
 class Redrawing:
-    """Base of augmenters whose pictures come from a checked regenerator: accounts for them (`Accounting`)."""
+    """Base of augmenters with a checked regenerator: reports its pictures (`Accounting`)."""
 
     regenerator: CheckedRegenerator
 
@@ -211,5 +201,5 @@ class Redrawing:
         return self.regenerator.tally.account_at(step)
 
     def recall(self, accounts: Sequence[Mapping[str, Any]]) -> None:
-        """Counts what the run requested before it was interrupted."""
+        """Adds the accounts of the run before its interruption."""
         self.regenerator.tally.recall(accounts)

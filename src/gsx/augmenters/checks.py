@@ -1,4 +1,4 @@
-"""Checks of redrawn pictures against what they were made from: size, colour, agreement, displacement."""
+"""Checks of redrawn pictures against their inputs: size, colour, agreement, displacement."""
 
 import math
 from dataclasses import dataclass
@@ -13,21 +13,21 @@ from gsx.core.shapes import Float
 from gsx.core.training.regenerator import Request
 
 LARGEST_DRIFT = 2 / 255
-"""Mean colours that differ by more are corrected."""
+"""Largest difference of mean colours that is not corrected."""
 MOST_CORRECTIONS = 4
-"""Corrections of a mean colour: where light is reduced, one is not enough."""
+"""Most corrections of a mean colour: reduction in linear light needs several."""
 LEAST_SLOPE = 1e-3
-"""Pictures with gentler slopes than this in some direction, display values per px, show no displacement in it."""
+"""Least RMS slope in every direction of a measurable displacement, display values per px."""
 ACTIONS = ("drop", "warn", "off")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """A limit, and what happens to a picture beyond it."""
+    """A limit and the action for pictures beyond it."""
 
     limit: Annotated[float, Range(0, 1e6)]
     action: str
-    """drop; warn: the picture is kept, counted and reported; off: nothing is checked."""
+    """drop; warn: keep, count and report the picture; off: no check."""
 
     def __post_init__(self) -> None:
         if self.action not in ACTIONS:
@@ -36,28 +36,28 @@ class Check:
 
 @dataclass(frozen=True, kw_only=True)
 class Checks:
-    """Limits that a redrawn picture must keep; values in conf/checks."""
+    """Limits for redrawn pictures; values in conf/checks."""
 
     colour: Check
     """Largest change of the mean colour, 8-bit levels, after `match_colour`."""
     agreement: Check
-    """Least PSNR between an enlarged picture, reduced again, and its input, dB."""
+    """Least PSNR between a reduced enlargement and its input, dB."""
     displacement: Check
     """Largest displacement, px of the input."""
 
 
 @runtime_checkable
 class WithChecks(Protocol):
-    """Options of an augmenter that has checks of its own; others get those of the regenerator's role."""
+    """Options of an augmenter with its own checks; others use those of the regenerator's role."""
 
     @property
     def checks(self) -> Checks:
-        """Limits for its redrawn pictures."""
+        """Return the limits for its redrawn pictures."""
         ...
 
 
 def defect(request: Request, result: Tensor) -> str:
-    """Says why a result is no picture of the requested kind; empty for one that is."""
+    """Describes why a result is no picture of the requested kind; empty: it is."""
     expected = (3, *request.result_size)
     if tuple(result.shape) != expected:
         return f"it is {tuple(result.shape)} and should be {expected}"
@@ -69,7 +69,7 @@ def defect(request: Request, result: Tensor) -> str:
 
 
 def match_colour(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """Corrects a mean colour that is more than LARGEST_DRIFT off at the resolution of the input."""
+    """Corrects a mean colour that differs by more than LARGEST_DRIFT at the input's resolution."""
     for _ in range(MOST_CORRECTIONS):
         low, source = reduced_pair(request, result)
         drift = low.mean((1, 2)) - source.mean((1, 2))
@@ -82,13 +82,13 @@ def match_colour(request: Request, result: Float[Tensor, "3 H W"]) -> Float[Tens
 def reduced_pair(
     request: Request, result: Float[Tensor, "3 H W"]
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "3 h w"]]:
-    """Returns (the result reduced to its input's size, the input) without the rim that pixels beyond it influence."""
+    """Returns (result reduced to its input's size, input) without the rim that outside pixels influence."""
     reduction = request.reduction
     return reduction.inner(reduction.reduce(result, request.scale)), reduction.inner(request.image.cpu())
 
 
 def violations(request: Request, result: Float[Tensor, "3 H W"], checks: Checks) -> dict[str, str]:
-    """Describes how a result differs from its input by more than active checks allow, by check."""
+    """Describes violations of the active checks, by check."""
     low, source = reduced_pair(request, result.cpu().float().clamp(0, 1))
     drift = 255 * float((low.mean((1, 2)) - source.mean((1, 2))).abs().max())
     agreement = psnr(low, source) if request.scale > 1 else math.inf
@@ -102,7 +102,7 @@ def violations(request: Request, result: Float[Tensor, "3 H W"], checks: Checks)
 
 
 def displacement(image: Float[Tensor, "3 h w"], reference: Float[Tensor, "3 h w"]) -> float:
-    """Measures the shift that explains the difference best to first order, px; 0 where nothing could show one.
+    """Estimates the shift between two pictures, px; 0 if slopes are too small.
 
     Source: Lucas and Kanade 1981; least squares of image - reference = shift . gradient.
     """

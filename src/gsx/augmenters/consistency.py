@@ -1,4 +1,4 @@
-"""Pictures that reduce to a given one in 8 bits: the paper's interpolation flexibility, guaranteed for box
+"""8-bit pictures that reduce exactly to their input: the paper's interpolation flexibility, guaranteed for box
 averages."""
 
 import torch
@@ -10,14 +10,14 @@ from gsx.core.shapes import Bool, Float, Int, UInt8
 
 BOX = Reduction()
 REPAIRS = 50
-"""Rounds in which errors of rounding are spread back, where blocks overlap."""
+"""Most rounds that spread rounding errors back, for overlapping blocks."""
 
 
 def exactly_consistent(
     image: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int, reduction: Reduction
 ) -> UInt8[Tensor, "3 H W"]:
-    """8-bit picture near `image` that reduces, rounded to 8 bits, to `low`: by box averages in every pixel, by other
-    filters in nearly every one that a picture between black and white can give back."""
+    """Returns the 8-bit picture near `image` that reduces to `low`: exactly for box averages, else in nearly all
+    pixels."""
     near = projected(image.float(), low.float() / 255, factor, reduction)
     return repaired(near, low, factor) if reduction == BOX else settled(near, low, factor, reduction)
 
@@ -25,7 +25,7 @@ def exactly_consistent(
 def settled(
     near: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int, reduction: Reduction
 ) -> UInt8[Tensor, "3 H W"]:
-    """Rounded; where that reduces to another level, what is missing is spread over the pixels that it came from."""
+    """Rounds a picture, and spreads remaining differences from `low` over its pixels."""
     known = low.float() / 255
     for _ in range(REPAIRS):
         off = known - reduction.reduce(to_uint8(near).float() / 255, factor)
@@ -37,9 +37,9 @@ def settled(
 
 
 def repaired(near: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int) -> UInt8[Tensor, "3 H W"]:
-    """Rounded such that a^2 (low - 1/2) <= sum of each block < a^2 (low + 1/2), at the least cost.
+    """Rounds such that a^2 (low - 1/2) <= sum of each block < a^2 (low + 1/2), at the least cost.
 
-    Values are moved by one level at a time, those first that rounding had moved the other way the most.
+    Moves values by one level at a time, first those that rounding moved most the other way.
     """
     values = blocks(to_uint8(near).long(), factor)
     exact = blocks(near * 255, factor)
@@ -55,7 +55,7 @@ def repaired(near: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: 
 
 
 def moves(values: Int[Tensor, "B a"], exact: Float[Tensor, "B a"], step: Int[Tensor, "B"]) -> Int[Tensor, "B a"]:
-    """One level more or less in the value of each block for which that costs least, within 0..255."""
+    """Returns one level more or less for the value of least cost in each block, within 0..255."""
     gain = (exact - values) * step[:, None]
     allowed = ((values + step[:, None]) >= 0) & ((values + step[:, None]) <= 255)
     chosen = torch.where(allowed, gain, -torch.inf).argmax(1)
@@ -63,13 +63,13 @@ def moves(values: Int[Tensor, "B a"], exact: Float[Tensor, "B a"], step: Int[Ten
 
 
 def blocks(image: Tensor, factor: int) -> Tensor:
-    """[3 h w, a^2]: the pixels of each block."""
+    """Returns the pixels of each block, [3 h w, a^2]."""
     parts = image.unfold(1, factor, factor).unfold(2, factor, factor)
     return parts.reshape(-1, factor * factor)
 
 
 def unblocked(values: Int[Tensor, "B a"], shape: torch.Size, factor: int) -> Int[Tensor, "3 H W"]:
-    """The image that `blocks` took apart; `shape` is that of the box average."""
+    """Returns the image of `blocks`; `shape`: of the box average."""
     channels, height, width = shape
     parts = values.view(channels, height, width, factor, factor).permute(0, 1, 3, 2, 4)
     return parts.reshape(channels, height * factor, width * factor)
@@ -78,7 +78,7 @@ def unblocked(values: Int[Tensor, "B a"], shape: torch.Size, factor: int) -> Int
 def consistent_pixels(
     image: UInt8[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int, reduction: Reduction
 ) -> Bool[Tensor, "h w"]:
-    """Pixels of `low` that the image gives back when it is reduced, in 8 bits, all channels."""
+    """Marks pixels of `low` that the image reduces to in 8 bits, in all channels."""
     if reduction == BOX:
         sums = blocks(image.long(), factor).sum(1).view(low.shape)
         back = ((2 * sums + factor * factor) // (2 * factor * factor)).to(torch.uint8)

@@ -1,4 +1,4 @@
-"""Which pixels of a pseudo view count: those photographs do not show better, those that agree with what is known."""
+"""Weights of a pseudo view's pixels: by the resolution of the photos, and by agreement with the input."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,26 +15,24 @@ from gsx.core.rasterizer.boxes import three_sigma
 from gsx.core.shapes import Float, Int, UInt8
 
 Draw: TypeAlias = Callable[[Camera], Splats]
-"""The splats of a camera."""
+"""Returns the splats that a camera draws."""
 WeightMap: TypeAlias = Callable[[Draw, Camera, Sequence[Camera], int, RasterSettings], Tensor]
-"""(the model, camera of the pseudo view, cameras of the photographs, which of them it was made from, rules to draw by)
--> weights of pixels, [h, w]."""
+"""(model, camera of the pseudo view, cameras of the photos, number of its photo, rules) -> pixel weights [h, w]."""
 BETTER, SOFTNESS = 1.1, 0.05
-"""SplatSuRe (2512.02172): sampled 1.1 times as finely is finer, over a soft edge."""
+"""Resolution ratio above which sampling is finer, and width of the soft edge (SplatSuRe, 2512.02172)."""
 LEAST_VIEWS = 3
-"""SplatSuRe: of splats that fewer photographs see nothing is sure."""
+"""Least photos that show a splat with a score (SplatSuRe)."""
 LEAST_PEAK = 0.9
-"""SplatSuRe: weights that stay below it in a whole photograph are min-max normalised."""
+"""Largest weight of a photo below which weights are min-max normalised (SplatSuRe)."""
 
 
 @torch.no_grad()
 def splatsure(
     drawn: Draw, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
 ) -> Float[Tensor, "h w"]:
-    """SplatSuRe's weights (2512.02172): low where another photograph than this one shows a surface more finely, since
-    it gives the detail; high in the one that shows it most finely, and where all show it alike or nothing is seen.
+    """Returns SplatSuRe's weights (2512.02172): low where another photo shows a surface more finely, else high.
 
-    Ours: drawn for the pseudo view itself instead of drawn for the photograph and enlarged.
+    Ours: rendered for the pseudo view instead of rendered for the photo and enlarged.
     """
     own, whole = (
         unscaled_weights(drawn(one), one, photographs, number, raster) for one in (camera, photographs[number])
@@ -45,13 +43,13 @@ def splatsure(
 def unscaled_weights(
     splats: Splats, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
 ) -> Float[Tensor, "h w"]:
-    """1 - the drawn score, + 1 where splats are drawn that photograph `number` shows most finely."""
+    """Renders 1 - score, plus 1 for splats that photo `number` shows most finely."""
     score, finest = sampling_scores(splats, photographs, raster)
     return 1 + blended((finest == number).to(score) - score, splats, camera, raster)
 
 
 def normalised(weights: Float[Tensor, "h w"], least: float, most: float) -> Float[Tensor, "h w"]:
-    """Weights in [0, 1]; from `least` to `most` of the whole photograph where its `most` is below LEAST_PEAK."""
+    """Clamps weights to [0, 1], after min-max normalisation if the photo's `most` is below LEAST_PEAK."""
     if least < most < LEAST_PEAK:
         weights = (weights - least) / (most - least)
     return weights.clamp(0, 1)
@@ -60,8 +58,10 @@ def normalised(weights: Float[Tensor, "h w"], least: float, most: float) -> Floa
 def sampling_scores(
     splats: Splats, photographs: Sequence[Camera], raster: RasterSettings
 ) -> tuple[Float[Tensor, "N"], Int[Tensor, "N"]]:
-    """(score of each splat: near 1 where some photograph shows it more finely than another, 0 below three that see it;
-    number of the photograph that shows it most finely, -1 for none) from largest and smallest radius on the screens."""
+    """Returns (scores, number of the photo with the largest radius or -1) of splats, by their radii on the screens.
+
+    A score is near 1 if one photo shows the splat more finely than another, 0 if fewer than LEAST_VIEWS show it.
+    """
     largest, smallest = torch.zeros_like(splats.scales[:, 0]), torch.full_like(splats.scales[:, 0], torch.inf)
     finest, views = torch.full_like(largest, -1, dtype=torch.long), torch.zeros_like(largest)
     for number, camera in enumerate(photographs):
@@ -75,18 +75,17 @@ def sampling_scores(
 
 
 def blended(values: Float[Tensor, "N"], splats: Splats, camera: Camera, raster: RasterSettings) -> Float[Tensor, "h w"]:
-    """Values of splats, drawn in place of their colours on black."""
+    """Renders values of splats in place of their colours, on black."""
     counted = replace(splats, colours=values[:, None].expand(-1, 3).contiguous())
     return rasterize(counted, camera, raster).image[0]
 
 
 def best_densities(points: Float[Tensor, "N 3"], cameras: Sequence[Camera]) -> Float[Tensor, "N"]:
-    """Returns the most pixels per scene unit that any camera has at each point; 0 where none sees it."""
+    """Returns the largest pixel density of any camera at each point, px per scene unit; 0 if no camera shows it."""
     best = torch.zeros_like(points[:, 0])
     for camera in cameras:
         places, depth = camera.project(points)
-        inside = ((places >= 0) & (places < places.new_tensor([camera.width, camera.height]))).all(1)
-        visible = (depth > camera.near) & inside
+        visible = camera.shows(places, depth)
         best = best.maximum(torch.where(visible, camera.fx / depth.clamp_min(camera.near), 0.0))
     return best
 
@@ -95,10 +94,9 @@ def best_densities(points: Float[Tensor, "N 3"], cameras: Sequence[Camera]) -> F
 def sampled_better(
     drawn: Draw, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
 ) -> Float[Tensor, "h w"]:
-    """Ours: 1 where a camera sees surfaces more finely than every photograph does, 0 where it does not; blended like
-    colour.
+    """Renders weights of 1 for surfaces that the camera shows more finely than every photo, else 0 (ours).
 
-    Occlusion is left aside: a photograph counts for what lies in its field of view. Unseen by all counts as 1.
+    Occlusion is ignored: a photo shows all splats in its field of view. Splats in no photo have weight 1.
     """
     splats = drawn(camera)
     means = splats.means.detach()
@@ -111,14 +109,13 @@ def sampled_better(
 def agreeing(
     result: Float[Tensor, "3 H W"], source: Float[Tensor, "3 h w"], scale: int, reduction: Reduction, levels: float
 ) -> Float[Tensor, "H W"]:
-    """1 in blocks where the result, reduced, is within `levels` of 255 of what it was made from in all channels, else
-    0."""
+    """Returns 1 in blocks where the reduced result is within `levels` of 255 of its source in all channels, else 0."""
     off = (reduction.reduce(result.clamp(0, 1), scale) - source).abs().amax(0) * 255
     return as_blocks((off <= levels).float(), scale)
 
 
 def in_bytes(weights: Float[Tensor, "h w"]) -> UInt8[Tensor, "h w"]:
-    """Weights from 0 to 1 as 0 to 255."""
+    """Quantises weights in [0, 1] to bytes."""
     return (weights * 255 + 0.5).clamp(0, 255).to(torch.uint8)
 
 
@@ -130,9 +127,9 @@ def undilated_radii(
     camera: Camera,
     settings: RasterSettings,
 ) -> Float[Tensor, "N"]:
-    """Returns three standard deviations on the screen before dilation, px; -1: it does not touch the raster.
+    """Returns three standard deviations on the screen before dilation, px, not rounded; -1: outside the raster.
 
-    3D-GS's formula (forward.cu), whose floor makes those much thinner than a pixel alike; not rounded up.
+    Source: 3D-GS, forward.cu, whose floor makes all splats much thinner than a pixel alike.
     """
     screen, on = on_screen(without_colours(means, scales, quats), camera, settings)
     dilation, _ = settings.dilation_at(camera.focal)

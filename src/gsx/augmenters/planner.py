@@ -1,4 +1,4 @@
-"""Which pseudo views an event makes: cameras, windows, seeds."""
+"""Plans of pseudo views at an event: cameras, windows, seeds."""
 
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Slot(NamedTuple):
     parent: int
     scale: int
     variant: int
-    """0: the training camera itself; others are moved at random."""
+    """0: the training camera; others: randomly moved cameras."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -38,11 +38,11 @@ class PseudoViewSpec:
     kind: str
     """base or random."""
     source: Camera
-    """Camera of what is redrawn, with context around it."""
+    """Camera of the input, with context around it."""
     inside: Window
-    """Part of the source that is kept."""
+    """Part of the source without context."""
     outer: Window | None
-    """Part of the photograph that the source is; None: it is rendered."""
+    """Source as a window of the photo; None: it is rendered."""
     camera: Camera
     """Camera of the result."""
     seed: int
@@ -50,18 +50,18 @@ class PseudoViewSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class Planner:
-    """Draws cameras and windows beside training views; everything random comes from seed, event, view and scale."""
+    """Random cameras and windows near training views, by seed, event, view and scale."""
 
     name: str
     options: PseudoOptions
     seed: int
     extent: float
-    """Of the scene, world units."""
+    """Extent of the scene, world units."""
     events: Sequence[int]
-    """Steps at which pseudo views are made."""
+    """Steps with new pseudo views."""
 
     def specs(self, run: Run, event: int, parents: Set[int]) -> Iterator[PseudoViewSpec]:
-        """Plans the pseudo views of some training views at an event, in their order, base before random."""
+        """Plans the pseudo views of some training views at an event, by view, scale, and base before random."""
         options = self.options
         for parent in sorted(parents):
             if options.first_cameras and parent >= options.first_cameras:
@@ -71,7 +71,7 @@ class Planner:
                 yield from (self.spec(run, Slot(event, parent, scale, variant)) for variant in variants)
 
     def scales_of(self, event: int) -> list[int]:
-        """Returns all scales, or the one whose turn it is."""
+        """Returns the scales of an event: all, or one of them if progressive."""
         scales = list(self.options.scales)
         if not self.options.progressive:
             return scales
@@ -91,7 +91,7 @@ class Planner:
         result, source = window.of(pose), outer.of(pose)
         if zoom > 1:
             result = result.zoom(zoom)
-        elif scale > 1:  # the other reading: fewer pixels are redrawn to as many
+        elif scale > 1:  # the other reading of the paper: reduced pixels are redrawn at full density
             inside, source, result = reduced(window, pose, scale)
         photo = slot.variant == 0 and options.base_source == "photo" and (zoom > 1 or scale == 1)
         return PseudoViewSpec(
@@ -108,7 +108,7 @@ class Planner:
     def pose_and_window(
         self, run: Run, slot: Slot, size: tuple[int, int], generator: torch.Generator
     ) -> tuple[Camera, Window]:
-        """Draws the pose and window of a pseudo view; at random until enough of the scene is in it."""
+        """Draws pose and window of a pseudo view; random ones until they show enough of the scene."""
         camera, options = run.train_views[slot.parent].camera, self.options
         checked = options.least_alpha > 0 and (slot.variant > 0 or (options.window == "random" and size != camera.size))
         for _ in range(MOST_TRIES if checked else 1):
@@ -135,7 +135,7 @@ class Planner:
     def window_in(
         self, run: Run, slot: Slot, pose: Camera, size: tuple[int, int], generator: torch.Generator
     ) -> Window:
-        """Places the window on the raster (the paper, Cropped Upscaling)."""
+        """Returns the window on the raster (the paper, Cropped Upscaling)."""
         width, height = pose.size
         kind, variant = self.options.window, slot.variant
         if kind == "random" or (kind == "error" and variant > 0):
@@ -151,7 +151,7 @@ class Planner:
 
 
 def reduced(window: Window, pose: Camera, scale: int) -> tuple[Window, Camera, Camera]:
-    """Returns (whole window, camera of 1/scale the density, camera of the result), with divisible sides."""
+    """Returns (whole reduced window, camera at 1/scale of the density, camera of the result) with divisible sides."""
     width, height = max(1, window.width // scale), max(1, window.height // scale)
     whole = Window(left=window.left, top=window.top, width=width * scale, height=height * scale).of(pose)
     return Window(left=0, top=0, width=width, height=height), whole.resize(width, height), whole

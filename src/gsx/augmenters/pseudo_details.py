@@ -1,11 +1,12 @@
-"""Pseudo details from training views: zoomed in and redrawn (upscale), moved aside and redrawn (bootstrap).
+"""Pseudo details: training views that are zoomed in (upscale) or moved (bootstrap), and redrawn.
 
-Both are one procedure: take windows of training cameras, some of them moved at random; zoom in; have a
-regenerator redraw what is cut from the photograph or rendered there; compare with that for a while.
+Both take windows of training cameras, some moved at random, zoom in, let a regenerator redraw the photo or the render
+there, and compare the model with the result for a while.
 """
 
 import logging
-from collections.abc import Sequence, Set
+from collections import defaultdict
+from collections.abc import Set
 from dataclasses import replace
 from typing import Any
 
@@ -26,11 +27,11 @@ from gsx.core.training.schedule import Schedule
 logger = logging.getLogger(__name__)
 
 LEAST_WINDOW = 4
-"""Narrowest window that shows anything, px."""
+"""Least side of a window, px."""
 
 
 class PseudoDetails(Redrawing):
-    """Pseudo views of one kind and their share in the loss."""
+    """Pseudo views of one kind and their term of the loss."""
 
     def __init__(self, options: PseudoOptions, context: AugmenterContext) -> None:
         self.options, self.context = options, context
@@ -55,7 +56,7 @@ class PseudoDetails(Redrawing):
         self.views: dict[int, list[PseudoView]] = {}
 
     def refuse_impossible(self) -> None:
-        """Now, not when half of the run is over."""
+        """Raises errors of impossible options before training."""
         options, name = self.options, self.context.name
         for view in self.context.scene.train:
             if options.coarser and min(view.camera.size) < LEAST_WINDOW * max(options.coarser):
@@ -75,19 +76,19 @@ class PseudoDetails(Redrawing):
             logger.warning("augmenter %s has no event in a run of %d steps", name, self.context.iterations)
 
     def begins(self) -> int:
-        """The first event."""
+        """Returns the first event."""
         return self.options.begins(self.context.iterations)
 
     def plan(self) -> dict[str, Any]:
-        """Events and windows in steps of this run."""
+        """Returns events and windows in steps of this run."""
         return {"events": self.events, "span": self.span, "share": self.share()}
 
     def share(self) -> float:
-        """The largest part of the photographs' loss that its terms replace."""
+        """Returns the largest share of the photo loss that its terms replace."""
         return 0.0 if self.options.mode == "direct" else max(self.options.weights)
 
     def term(self, run: Run, step: int, view: int) -> Term | None:
-        """The pseudo views of the training view picked at this step, with their weights."""
+        """Returns the weighted pseudo views of this step's training view."""
         event = event_at(step, self.events, self.span)
         if event is None:
             self.views, self.event = {}, 0
@@ -95,7 +96,9 @@ class PseudoDetails(Redrawing):
         made: list[PseudoView] = []
         if event != self.event:
             views, fresh = self.of_event(run, event, view)
-            self.views, self.event = by_parent(views), event
+            self.views, self.event = defaultdict(list), event
+            for pseudo in views:
+                self.views[pseudo.parent].append(pseudo)
             made = views if fresh else []
         split = self.options.weight_split
         inside, place = (progress(step, event, self.events, self.span, kind) for kind in ("window", split))
@@ -104,10 +107,9 @@ class PseudoDetails(Redrawing):
         return replace(self.weighted(run, view, place, inside), made=made)
 
     def weighted(self, run: Run, view: int, place: float, inside: float) -> Term:
-        """Weights the pseudo views of a training view, at a place along the weights and inside the window, 0 to 1.
+        """Weights the pseudo views of a training view, at places along the weights and the window, 0 to 1.
 
-        A view weighs the same whether others of its training view were dropped or not; what these would have taken of
-        the backbone's own loss stays there.
+        Dropped views do not change the weights of the others; their share stays with the backbone's own loss.
         """
         options, views = self.options, self.views.get(view, [])
         share = stepped(options.weights, place, options.weight_split)
@@ -129,37 +131,32 @@ class PseudoDetails(Redrawing):
         )
 
     def planned(self) -> tuple[int, int]:
-        """(scales, pictures) of each training view at the event at hand, if none is dropped."""
+        """Returns (scales, pictures) of each training view at this event, dropped ones included."""
         options, scales = self.options, len(self.planner.scales_of(self.event))
         coarser = len(options.coarser)
         return scales + coarser, scales * (options.variants + options.base) + coarser
 
     def of_event(self, run: Run, event: int, view: int) -> tuple[list[PseudoView], bool]:
-        """Returns (the pseudo views of an event, whether they were made for this step).
+        """Returns (pseudo views of an event, whether they are new), new ones made and stored by rank 0.
 
-        They are made now, or read as the run made them before it was interrupted.
-
-        Only those that steps of its window will ask for, the first of them for `view` and the rest of its batch: the
-        others are never looked at. Of several processes the first makes them all.
+        Only training views that steps of the event's window use get pseudo views: `view`, the rest of its batch, and
+        the coming ones.
 
         Raises:
-            InputError: the run is past the event, and the file of its pseudo views is gone.
+            InputError: the run was interrupted after the event, and the file of its pseudo views is missing.
         """
-        fresh = all(run.skipped(step) for step in range(event + 1, run.step + 1))  # no step of it was taken yet
-        made = self.written(run, event, view) if fresh and run.ranks.first else None
+        made: list[PseudoView] | None = None
+        fresh = all(run.skipped(step) for step in range(event + 1, run.step + 1))
+        if fresh and run.ranks.first:
+            steps = min(event + self.span, run.iterations) - run.step
+            made, facts = self.made(run, event, {view, *run.sampler.current} | run.sampler.coming(steps - 1))
+            self.store.write(run, event, made, facts)
         if fresh:
             run.ranks.all_gather(None)  # the others wait for the file
         return (self.store.recalled(run, event) if made is None else made), fresh
 
-    def written(self, run: Run, event: int, view: int) -> list[PseudoView]:
-        """The pseudo views of an event that begins with this step, made and written to its file."""
-        steps = min(event + self.span, run.iterations) - run.step
-        views, facts = self.made(run, event, {view, *run.sampler.current} | run.sampler.coming(steps - 1))
-        self.store.write(run, event, views, facts)
-        return views
-
     def made(self, run: Run, event: int, parents: Set[int]) -> tuple[list[PseudoView], dict[str, Any]]:
-        """(pseudo views of some training views, facts) of an event, from the model as it is now."""
+        """Makes (pseudo views of some training views, facts) of an event with the current model."""
         learnt = self.regenerator.prepare(run, self.context)
         if learnt:
             figures = ", ".join(f"{name} {value:.3g}" for name, value in learnt.items())
@@ -172,28 +169,18 @@ class PseudoDetails(Redrawing):
             for factor in self.options.coarser
         ]
         facts: dict[str, Any] = {
-            **self.regenerator.tally.account(run.step),  # after which they are made: late, where steps were left out
+            **self.regenerator.tally.account(run.step),  # after which they are made: late if steps were skipped
             "event": event,
             "iterations": self.context.iterations,
             "made": len(views),
             "learnt": learnt,
         }
-        counted = [float(view.pixel_weight.float().mean()) / 255 for view in views if view.pixel_weight is not None]
-        kept = [view.provenance["consistent"] for view in views if "consistent" in view.provenance]
-        if kept:
-            share = sum(kept) / len(kept)
-            facts["consistent"] = share
-            logger.info("%s: %.1f%% consistent pixels", self.context.name, 100 * share)
-        if counted:
-            masked = 1 - (sum(counted) + len(views) - len(counted)) / len(views)
-            facts["masked"] = masked
-            logger.info("%s: %.1f%% of the pixels do not count", self.context.name, 100 * masked)
+        weights = [float(view.pixel_weight.float().mean()) / 255 for view in views if view.pixel_weight is not None]
+        shares = [view.provenance["consistent"] for view in views if "consistent" in view.provenance]
+        if shares:
+            facts["consistent"] = sum(shares) / len(shares)
+            logger.info("%s: %.1f%% consistent pixels", self.context.name, 100 * facts["consistent"])
+        if weights:
+            facts["masked"] = 1 - (sum(weights) + len(views) - len(weights)) / len(views)
+            logger.info("%s: %.1f%% of the pixels do not count", self.context.name, 100 * facts["masked"])
         return views, facts
-
-
-def by_parent(views: Sequence[PseudoView]) -> dict[int, list[PseudoView]]:
-    """Pseudo views by the training view they were made from."""
-    found: dict[int, list[PseudoView]] = {}
-    for view in views:
-        found.setdefault(view.parent, []).append(view)
-    return found

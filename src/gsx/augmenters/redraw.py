@@ -1,4 +1,4 @@
-"""Pictures of pseudo views: requested, redrawn, weighed (the paper, Practical Implementation)."""
+"""Pictures of pseudo views: requests, redrawing and pixel weights (the paper, Practical Implementation)."""
 
 import hashlib
 import logging
@@ -35,14 +35,14 @@ from gsx.core.training.schedule import Schedule
 logger = logging.getLogger(__name__)
 
 BATCH = 64
-"""Pictures redrawn between two lines of progress."""
+"""Pictures redrawn per line of progress."""
 PICTURED = 3
-"""Training views of an event whose pictures are kept for people."""
+"""Training views of an event with comparison pictures."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Redrawer:
-    """Has a regenerator redraw the pictures of pseudo views, and weighs those that pass the checks."""
+    """Pictures of pseudo views by a checked regenerator, with pixel weights."""
 
     name: str
     options: PseudoOptions
@@ -50,7 +50,7 @@ class Redrawer:
     schedule: Schedule
 
     def redraw_all(self, run: Run, event: int, specs: Sequence[PseudoViewSpec]) -> list[PseudoView]:
-        """Makes the planned pseudo views, without those whose pictures are dropped, and logs each batch."""
+        """Makes the planned pseudo views, except those with dropped pictures, and logs each batch."""
         views: list[PseudoView] = []
         pictured = sorted({spec.parent for spec in specs})[:PICTURED]
         for first in range(0, len(specs), BATCH):
@@ -62,7 +62,7 @@ class Redrawer:
     def redraw_batch(
         self, run: Run, event: int, specs: Sequence[PseudoViewSpec], pictured: Sequence[int]
     ) -> list[PseudoView]:
-        """Makes some pseudo views, and writes pictures of those of the training views `pictured`."""
+        """Makes some pseudo views, and writes comparison pictures for the training views `pictured`."""
         views = []
         requests = [self.request(run, event, spec) for spec in specs]
         run.raise_if_stopping()
@@ -77,7 +77,7 @@ class Redrawer:
         return views
 
     def request(self, run: Run, event: int, spec: PseudoViewSpec) -> Request:
-        """Describes a picture to the regenerator."""
+        """Returns the request for a planned pseudo view."""
         run.raise_if_stopping()
         view = run.train_views[spec.parent]
         outer = spec.outer
@@ -100,7 +100,7 @@ class Redrawer:
     def view(
         self, run: Run, event: int, spec: PseudoViewSpec, request: Request, result: Float[Tensor, "3 H W"]
     ) -> PseudoView:
-        """Makes the pseudo view of a result: its window, in 8 bits."""
+        """Makes the pseudo view of a result: its window in 8 bits."""
         a, inside, reduction = spec.scale, spec.inside, request.reduction
         enlarged = request.photo and a > 1
         target, low = to_uint8(result.clamp(0, 1)), to_uint8(request.image)
@@ -128,7 +128,7 @@ class Redrawer:
         )  # fmt: skip
 
     def coarser_view(self, run: Run, event: int, parent: int, factor: int) -> PseudoView:
-        """Makes the pseudo view of a training camera at a fraction of its size, without partial blocks at the rim."""
+        """Makes the pseudo view of a reduced training camera, without partial blocks at the rim."""
         run.raise_if_stopping()
         view = run.train_views[parent]
         width, height = view.camera.size
@@ -144,7 +144,7 @@ class Redrawer:
     def pixel_weight(
         self, run: Run, spec: PseudoViewSpec, request: Request, result: Float[Tensor, "3 H W"], window: Window
     ) -> UInt8[Tensor, "h w"] | None:
-        """Weighs the pixels of a window of the result; None where all count whole."""
+        """Returns pixel weights of a window of the result; None: all are 1."""
         options, pixel_weight = self.options, torch.ones(window.height, window.width)
         weights = WEIGHT_MAPS[options.weight_map]
         if weights is not None:
@@ -157,7 +157,7 @@ class Redrawer:
         return None if bool((pixel_weight == 1).all()) else in_bytes(pixel_weight)
 
     def write_comparison(self, folder: Path, spec: PseudoViewSpec, request: Request, view: PseudoView) -> None:
-        """Writes a picture of what was redrawn, enlarged, the result, and their difference."""
+        """Writes a picture of the enlarged input, the result, and their difference."""
         source = as_blocks(spec.inside.cut(request.image), spec.scale)
         result = view.target.float() / 255
         difference = (0.5 + 4 * (result - source)).clamp(0, 1)
@@ -175,7 +175,7 @@ def provenance(
     photo: bool,
     **more: float,
 ) -> dict[str, Any]:
-    """Describes where a pseudo view comes from."""
+    """Returns the origin of a pseudo view, for its file."""
     return {
         "event": event,
         "made_after_step": run.step,
@@ -189,6 +189,6 @@ def provenance(
 
 
 def photo_window(run: Run, view: View, window: Window, camera: Camera) -> Float[Tensor, "3 h w"]:
-    """Cuts a window out of a photograph; a render by the window's camera stands in for masked pixels."""
+    """Cuts a window out of a photo; a render by the window's camera replaces masked pixels."""
     photo, counted = window.cut(view.image()), view.counted()
     return photo if counted is None else where_counted(photo, render(run, camera).image.cpu(), counted[window.pixels])

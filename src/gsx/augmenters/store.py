@@ -1,4 +1,4 @@
-"""Files of pseudo views: what a run made at an event, until no checkpoint needs it."""
+"""Files of pseudo views, kept while a checkpoint needs them."""
 
 import json
 import logging
@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class Store:
-    """The pseudo views of one augmenter in the folder of a run, a file an event."""
+    """Pseudo views of one augmenter in a run folder, a file per event."""
 
     name: str
     iterations: int
@@ -31,22 +31,22 @@ class Store:
     span: int
 
     def write(self, run: Run, event: int, views: Sequence[PseudoView], facts: dict[str, Any]) -> None:
-        """Keeps the pseudo views of an event in place of those that no checkpoint needs any more."""
+        """Writes the pseudo views of an event, and removes files that no checkpoint needs."""
         path = self.path(run, event)
         path.parent.mkdir(parents=True, exist_ok=True)
         save_views(path, views, facts)
         self.forget(run, event)
 
     def path(self, run: Run, event: int) -> Path:
-        """Where the pseudo views of an event are kept while a checkpoint may need them."""
+        """Returns the file of an event."""
         return run.folder / "pseudo" / f"{self.name}_{event:07d}.safetensors"
 
     def files(self, run: Run) -> list[Path]:
-        """Those that there are, oldest first."""
+        """Returns the existing files, oldest first."""
         return sorted((run.folder / "pseudo").glob(f"{self.name}_{'[0-9]' * 7}.safetensors"))
 
     def forget(self, run: Run, event: int) -> None:
-        """Removes the files of events in whose windows no checkpoint lies, but for that of the current one."""
+        """Removes files of past events without a checkpoint in their window."""
         steps = map(step_of, sidecars(run.folder / "checkpoints"))
         needed = {event} | {event_at(step + 1, self.events, self.span) for step in steps}
         kept = {self.path(run, number) for number in needed if number is not None}
@@ -55,32 +55,32 @@ class Store:
                 path.unlink()
 
     def recalled(self, run: Run, event: int) -> list[PseudoView]:
-        """The pseudo views that the run had made before it was interrupted.
+        """Reads the pseudo views that the run made before its interruption.
 
-        None where it was made longer since, so that its events and windows lie elsewhere: the next one goes on.
+        A run that became longer has other events: it continues without pseudo views until the next one.
         """
         path = self.path(run, event)
         latest = [path] if path.is_file() else self.files(run)[-1:]
         try:
             if latest and (found := load_views(latest[0]))[1]["iterations"] != self.iterations:
-                logger.info("%s rests until its next event: the run has become longer", self.name)
+                logger.info("%s: the run became longer, no pseudo views until the next event", self.name)
                 return []
             return found[0] if latest == [path] else load_views(path)[0]
         except (OSError, ValueError) as error:
             raise InputError(
-                f"{path} cannot be read ({error}): it holds the pseudo views of step {event}, without which the run "
-                f"cannot go on at step {run.step}; restore the file, or train anew"
+                f"{path} cannot be read ({error}): the run needs the pseudo views of step {event} to continue at step "
+                f"{run.step}; restore the file, or train anew"
             ) from error
 
 
 def picture_name(augmenter: str, view: PseudoView) -> str:
-    """File of what a pseudo view was made from, the result, and their difference, side by side."""
+    """Returns the file name of a pseudo view's comparison picture."""
     known = view.provenance
     return f"{augmenter}_{known['event']:07d}_{view.parent}_x{known['scale']}_{known['kind']}.png"
 
 
 def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -> None:
-    """Writes pseudo views and `facts` as one safetensors file, whole or not at all."""
+    """Writes pseudo views and `facts` as one safetensors file, atomically."""
     from safetensors.torch import save
 
     tensors: dict[str, Tensor] = {}
@@ -102,7 +102,7 @@ def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -
 
 
 def load_views(path: Path) -> tuple[list[PseudoView], dict[str, Any]]:
-    """(views, facts) as `save_views` wrote them."""
+    """Reads (views, facts) as `save_views` wrote them."""
     from safetensors import SafetensorError, safe_open
 
     try:

@@ -1,4 +1,4 @@
-"""When pseudo views are made, how long they count, and how much (the paper, Practical Implementation)."""
+"""Timing of pseudo views: events, windows and weights (the paper, Practical Implementation)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,20 +6,18 @@ from dataclasses import dataclass
 from gsx.core.ranges import Interval, Steps
 from gsx.core.training.schedule import Schedule
 
-SPLITS = ("window", "run", "linear")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """Events of a published run and the windows after them, in steps of that run."""
+    """Events of a published run and the windows after them, in its steps."""
 
     published_iterations: Interval
     start: Steps
-    """Step at whose end pseudo views are first made."""
+    """Step after which pseudo views are first made."""
     stop: Steps
     every: Interval
     span: Interval
-    """Steps after an event in which its pseudo views count."""
+    """Length of the window after an event, in which its pseudo views count."""
     stop_inclusive: bool
 
     def __post_init__(self) -> None:
@@ -30,7 +28,7 @@ class Timing:
 
 
 def events_of(timing: Timing, schedule: Schedule) -> list[int]:
-    """Steps of this run at whose end pseudo views are made; in very short runs fewer, never two at one step."""
+    """Returns the steps of this run after which pseudo views are made, without duplicates in very short runs."""
     last = timing.stop + 1 if timing.stop_inclusive else timing.stop
     published = range(timing.start, last, timing.every)
     steps = {max(1, schedule.step(step)) for step in published}
@@ -38,25 +36,25 @@ def events_of(timing: Timing, schedule: Schedule) -> list[int]:
 
 
 def span_of(timing: Timing, schedule: Schedule) -> int:
-    """Steps of this run for which pseudo views count."""
+    """Returns the length of a window in steps of this run."""
     return max(1, schedule.step(timing.span))
 
 
 def event_at(step: int, events: Sequence[int], span: int) -> int | None:
-    """The event whose window a step (1-based) lies in; windows never outlast the next event."""
+    """Returns the event whose window contains a step (1-based), if any."""
     earlier = [event for event in events if event < step]
     return earlier[-1] if earlier and step <= earlier[-1] + span else None
 
 
 def progress(step: int, event: int, events: Sequence[int], span: int, split: str) -> float:
-    """How far along a step is, 0 to 1: in its window, or in the run from the first event to the last window's end."""
+    """Returns the place of a step, 0 to 1: in its window, or (run) from the first event to the last window's end."""
     if split == "run":
         return (step - events[0] - 1) / max(1, events[-1] + span - events[0] - 1)
     return (step - event - 1) / max(1, span - 1)
 
 
 def stepped(values: list[float], place: float, split: str) -> float:
-    """A weight that changes half-way (window, run) or is interpolated between the two values (linear)."""
+    """Returns a weight that changes half-way (window, run) or linearly (linear) between two values."""
     first, last = values
     if split == "linear":
         return first + (last - first) * place
@@ -64,7 +62,7 @@ def stepped(values: list[float], place: float, split: str) -> float:
 
 
 def ramp(values: list[float], event: int, timing: Timing, schedule: Schedule) -> float:
-    """A value that goes linearly from its first at `start` to its last at `stop`."""
+    """Interpolates a value linearly from `start` to `stop`."""
     first, last = values
     start, stop = schedule.step(timing.start), schedule.step(timing.stop)
     return first + (last - first) * min(1.0, max(0, event - start) / max(1, stop - start))
