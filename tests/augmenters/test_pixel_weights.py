@@ -101,13 +101,9 @@ def test_splats_far_below_a_pixel_are_alike_by_the_published_floor_and_dilation_
     )
     assert float(tiny[0]) == pytest.approx(0.1192, abs=1e-3)
     assert float(small[0]) == pytest.approx(1.0, abs=1e-3)
-    radii = undilated_radii(*geometry(dots((0.0, 0.0, 0.0), scale=0.2)), at(1.0), RasterSettings())
+    radii = undilated_radii(dots((0.0, 0.0, 0.0), scale=0.2), at(1.0), RasterSettings())
     variance = (at(1.0).fx * 0.2) ** 2
     assert float(radii) == pytest.approx(3 * (variance + 0.1**0.5) ** 0.5, rel=1e-3)
-
-
-def geometry(splats: Splats) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    return splats.means, splats.scales, splats.quats
 
 
 def test_only_training_views_that_see_a_splat_count() -> None:

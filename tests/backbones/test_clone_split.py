@@ -451,7 +451,7 @@ def test_files_have_the_published_columns(words: tuple[str, ...], tmp_path: Path
     assert torch.equal(columns["extra_level"], backbone.table["bias"])
     assert columns["info"].tolist() == [8.0] + [0.0] * (len(backbone.table) - 1)
     assert "standard_dist 8.0" in backbone.file_notes()[1]
-    scales, log_opacities = extents(backbone.table, everything(backbone.table), backbone.filter)
+    scales, log_opacities = extents(backbone.table, everything(backbone.table))
     torch.testing.assert_close(columns["scale_1"].exp(), scales[:, 1].detach())
     torch.testing.assert_close(columns["opacity"].sigmoid(), log_opacities.detach().exp())
 

@@ -5,19 +5,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_scene import small_context, small_scene, spread
 from test_heads import SMALL, heads_of
 from torch import Tensor
 from torch.nn import Parameter
 
 from gsx.backbones.decoding import DrawnAnchors, Explicit, Neural, VisibleAnchors, baked
 from gsx.backbones.heads import Heads
-from gsx.backbones.mip import Filter, MipFilter, MipOptions
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Splats
 from gsx.core.training.parameter_table import ParameterTable
-from gsx.core.training.schedule import Schedule
 
 CAMERA = look_at([0.3, -4, 1], [0, 0, 0], fov_x=0.9, width=24, height=16)
 FIELDS = ("means", "scales", "quats", "log_opacities", "colours")
@@ -33,14 +30,6 @@ class Fixed(Heads):
     def forward(self, feature, offset, level, view):
         self.asked = (feature, offset, level, view)
         return self.outputs
-
-
-MIP = MipFilter(
-    options=MipOptions(variance=0.2, kernel=0.1, margin=0.15, near=0.2, every=100, stop=1000),
-    context=small_context(small_scene(spread(4))),
-    schedule=Schedule(iterations=1000, published_iterations=1000, views=1),
-    density_ends=500,
-)
 
 
 def table_of(count: int = 6, k: int = 3, dtype: torch.dtype = torch.float32, **columns: Tensor) -> ParameterTable:
@@ -113,7 +102,7 @@ def test_anchors_decode_as_in_a_loop() -> None:
     table = table_of()
     opacities = [[0.5, -0.2, 0.9], [-0.1, -1.0, -0.3], [0.0, 1.0, 1e-30], [0.1, 0.2, 0.3]]
     heads, drawn = fixed_outputs(opacities), draw([1, 2, 4, 5])
-    decoded = Neural(heads).decode(table, drawn, Filter())
+    decoded = Neural(heads).decode(table, drawn)
     check_against_loop(decoded, table, heads, drawn)
     assert decoded.slots.tolist() == [3, 5, 13, 14, 15, 16, 17], "0 is not drawn, 1e-30 is"
 
@@ -121,7 +110,7 @@ def test_anchors_decode_as_in_a_loop() -> None:
 def test_weights_of_a_level_fade_opacities_before_the_choice() -> None:
     table, opacities = table_of(), [[0.5, -0.2, 0.9], [0.4, 0.3, -0.3], [0.1, 0.2, 0.3]]
     heads, drawn = fixed_outputs(opacities), draw([0, 3, 4], [0.25, 0.0, 1.0])
-    decoded = Neural(heads).decode(table, drawn, Filter())
+    decoded = Neural(heads).decode(table, drawn)
     check_against_loop(decoded, table, heads, drawn)
     assert decoded.slots.tolist() == [0, 2, 12, 13, 14], "nothing is left of an anchor of weight 0"
 
@@ -129,7 +118,7 @@ def test_weights_of_a_level_fade_opacities_before_the_choice() -> None:
 def test_networks_are_asked_with_the_feature_and_from_the_camera_to_the_anchor() -> None:
     table = table_of(level=torch.tensor([0, 1, 2, 3, 4, 5], dtype=torch.int16))
     heads = fixed_outputs([[0.5] * 3] * 2)
-    Neural(heads).decode(table, draw([4, 2], view=7), Filter())
+    Neural(heads).decode(table, draw([4, 2], view=7))
     feature, offset, level, view = heads.asked
     assert torch.equal(feature, table["features"][[4, 2]])
     torch.testing.assert_close(offset, table["anchors"][[4, 2]] - torch.tensor([0.3, -4, 1]))
@@ -144,7 +133,7 @@ def test_fresh_anchors_decode_to_their_place_at_about_half_their_length() -> Non
     assert not rows["features"].any()
     assert not rows["offsets"].any()
     table = ParameterTable({n: Parameter(v) for n, v in rows.items()}, {"anchors": torch.arange(9.0).view(3, 3)})
-    decoded = neural.decode(table, draw([0, 1, 2]), Filter())
+    decoded = neural.decode(table, draw([0, 1, 2]))
     owner = decoded.slots // 3
     assert torch.equal(decoded.splats.means, table["anchors"][owner])
     length = torch.tensor([0.0, 1.0, -2.0]).exp()[owner, None]
@@ -152,12 +141,12 @@ def test_fresh_anchors_decode_to_their_place_at_about_half_their_length() -> Non
     with torch.no_grad():
         neural.heads.covariance[2].weight.zero_()
         neural.heads.covariance[2].bias.zero_()
-    scales = neural.decode(table, draw([0, 1, 2]), Filter()).splats.scales
+    scales = neural.decode(table, draw([0, 1, 2])).splats.scales
     torch.testing.assert_close(scales, (0.5 * length).expand(-1, 3))
 
 
 def test_decoded_values_lie_where_they_may() -> None:
-    splats = Neural(heads_of()).decode(table_of(count=40), draw(list(range(40))), Filter()).splats
+    splats = Neural(heads_of()).decode(table_of(count=40), draw(list(range(40)))).splats
     assert 0 < len(splats) < 120
     assert (splats.log_opacities < 0).all()
     assert ((splats.colours > 0) & (splats.colours < 1)).all()
@@ -166,7 +155,7 @@ def test_decoded_values_lie_where_they_may() -> None:
 def test_a_camera_at_an_anchor_decodes_finite_values() -> None:
     table = table_of()
     table.columns["anchors"][2] = CAMERA.centre.float()
-    splats = Neural(heads_of(seed=2)).decode(table, draw([2]), Filter()).splats
+    splats = Neural(heads_of(seed=2)).decode(table, draw([2])).splats
     assert all(torch.isfinite(getattr(splats, name)).all() for name in FIELDS)
 
 
@@ -185,7 +174,7 @@ def test_gradients_of_decoding_are_finite_differences(filtered: bool) -> None:
 
     def decode(*values: Tensor) -> tuple[Tensor, ...]:
         table.parameters = dict(zip(names, values, strict=True))
-        return decoded_values(neural.decode(table, drawn, MIP if filtered else Filter()))
+        return decoded_values(neural.decode(table, drawn))
 
     values = [table[name].detach().clone().requires_grad_() for name in names]
     assert len(decode(*values)[0]) > 0
@@ -194,9 +183,7 @@ def test_gradients_of_decoding_are_finite_differences(filtered: bool) -> None:
 
 def test_every_network_learns() -> None:
     neural = Neural(heads_of(replace(SMALL, bank=True, appearance=2)))
-    sum(
-        value.square().sum() for value in decoded_values(neural.decode(table_of(), draw([0, 1, 2]), Filter()))
-    ).backward()
+    sum(value.square().sum() for value in decoded_values(neural.decode(table_of(), draw([0, 1, 2])))).backward()
     for name, parameter in neural.heads.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.abs().sum() > 0, name
@@ -206,7 +193,7 @@ def test_every_network_learns() -> None:
 def test_nothing_to_draw_is_no_error(rows: list[int]) -> None:
     table, heads = table_of(), fixed_outputs([[-0.5, 0.0, -1.0]] * 2)
     heads.outputs = tuple(output[: len(rows)] for output in heads.outputs)
-    decoded = Neural(heads).decode(table, draw(rows), Filter())
+    decoded = Neural(heads).decode(table, draw(rows))
     assert len(decoded.splats) == 0
     assert tuple(decoded.opacities.shape) == (len(rows), 3)
     assert not decoded.opacities.any()
@@ -216,7 +203,7 @@ def test_long_lengths_stay_finite() -> None:
     table = table_of()
     with torch.no_grad():
         table["log_scales"].fill_(1000.0)
-    splats = Neural(fixed_outputs([[0.5] * 3])).decode(table, draw([0]), Filter()).splats
+    splats = Neural(fixed_outputs([[0.5] * 3])).decode(table, draw([0])).splats
     assert torch.isfinite(splats.scales.square()).all()
     assert torch.isfinite(splats.means).all()
 
@@ -226,7 +213,7 @@ def test_long_lengths_stay_finite() -> None:
 
 def test_explicit_anchors_decode_as_in_a_loop() -> None:
     table, drawn = explicit_table(), draw([5, 0, 3], [1.0, 0.25, 0.5], sh_degree=2)
-    decoded = Explicit(3, 0.0).decode(table, drawn, Filter())
+    decoded = Explicit(3, 0.0).decode(table, drawn)
     assert decoded.slots.tolist() == [5, 0, 3]
     for i, row in enumerate([5, 0, 3]):
         length = table["log_scales"][row].exp()
@@ -248,7 +235,7 @@ def test_gradients_of_explicit_decoding_are_finite_differences() -> None:
 
     def decode(*values: Tensor) -> tuple[Tensor, ...]:
         table.parameters = dict(zip(names, values, strict=True))
-        return decoded_values(Explicit(3, 0.0).decode(table, drawn, Filter()))
+        return decoded_values(Explicit(3, 0.0).decode(table, drawn))
 
     assert torch.autograd.gradcheck(decode, [table[name].detach().clone().requires_grad_() for name in names])
 
@@ -275,6 +262,6 @@ def test_values_that_underflow_can_be_written() -> None:
     )
     values = vars(baked(splats, torch.zeros(1, 3), torch.zeros(1, 0, 3)))
     assert all(torch.isfinite(value).all() for value in values.values())
-    faded = Explicit(3, 0.0).decode(explicit_table(), draw([1], [0.0]), Filter())
+    faded = Explicit(3, 0.0).decode(explicit_table(), draw([1], [0.0]))
     assert torch.isfinite(faded.splats.log_opacities).all()
     assert float(faded.opacities) < 1e-30

@@ -303,8 +303,8 @@ def level_up(
     quirks = replace(REFERENCE, **{name: value for name, value in changes.items() if name in CHOICES})
     options = replace(PUBLISHED, **{name: value for name, value in changes.items() if name not in CHOICES})
     levels = levels or three_levels()
-    room = under(most, table)
-    return LevelGrowth(table, representation, options, 40.0, room, levels, quirks, gate).grow()[0]
+    room, finest = under(most, table), levels.size(levels.count - 1)
+    return LevelGrowth(table, representation, options, 40.0, room, finest, levels, quirks, gate).grow()[0]
 
 
 def grown_levels(table: ParameterTable, before: int) -> list[tuple]:

@@ -337,7 +337,7 @@ def test_reset_caps_opacities_and_forgets_their_moments_alone() -> None:
     backbone.update(1)
     faint = backbone.table["opacity_logits"].detach()[2:].clone()
     others = {name: backbone.table[name] for name in NAMES if name != "opacity_logits"}
-    backbone.control.reset_opacities(backbone.table, backbone.filter)
+    backbone.control.reset_opacities(backbone.table)
     logits = backbone.table["opacity_logits"].detach()
     torch.testing.assert_close(logits[:2], torch.full((2,), -4.5951199))  # logit(0.01)
     torch.testing.assert_close(logits[2:], faint)
@@ -355,7 +355,7 @@ def test_reset_leaves_invisible_primitives_finite() -> None:
     backbone = hand_made([0.0] * 3, [0.01] * 3)
     with torch.no_grad():
         backbone.table["opacity_logits"].copy_(torch.tensor([-200.0, 200.0, 0.0]))
-    backbone.control.reset_opacities(backbone.table, backbone.filter)
+    backbone.control.reset_opacities(backbone.table)
     expected = torch.tensor([-200.0, -4.5951199, -4.5951199])
     torch.testing.assert_close(backbone.table["opacity_logits"].detach(), expected)
 

@@ -16,11 +16,10 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from gsx.backbones import mip
-from gsx.backbones.density import mean_absolute, mean_gradient, zero_statistics
+from gsx.backbones.density import mean_absolute, mean_gradient, quantile, zero_statistics
 from gsx.backbones.density_control import candidates
 from gsx.backbones.gs3d import GS3D
 from gsx.backbones.mip import MATCHED, MipOptions, filter_sizes, pseudo_view_sizes, several_views
-from gsx.backbones.sampling import quantile
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.reduction import Reduction
@@ -365,7 +364,7 @@ def test_a_reset_caps_what_is_drawn() -> None:
     backbone = row_values([2.0, 0.1, 3.0, 0.02], [0.9, 0.5, 0.002, 0.9])
     before, raw = drawn_opacities(backbone), backbone.table["opacity_logits"].detach().clone()
     assert [bool(opacity > 0.01) for opacity in before] == [True, False, False, False], "the test needs both kinds"
-    backbone.control.reset_opacities(backbone.table, backbone.filter)
+    backbone.control.reset_opacities(backbone.table)
     after = backbone.table["opacity_logits"].detach()
     assert torch.equal(after[1:], raw[1:])  # 0.5 and 0.9 raw: drawn fainter than 0.01
     assert drawn_opacities(backbone)[0].item() == pytest.approx(0.01, rel=1e-5)
@@ -383,7 +382,7 @@ def test_a_reset_never_raises_an_opacity(rows: list[tuple[float, float]], highes
         backbone.table["opacity_logits"].copy_(torch.tensor([logit for logit, _ in rows]))
         backbone.table["log_scales"].copy_(torch.tensor([scale for _, scale in rows])[:, None].expand(-1, 3))
     before = backbone.table["opacity_logits"].detach().clone()
-    backbone.control.reset_opacities(backbone.table, backbone.filter)
+    backbone.control.reset_opacities(backbone.table)
     after = backbone.table["opacity_logits"].detach()
     assert torch.isfinite(after).all()
     assert (after <= before).all()
@@ -401,7 +400,7 @@ def test_without_the_filter_a_reset_caps_raw_opacities() -> None:
     backbone = small_gs3d(small_scene(spread(3)))
     with torch.no_grad():
         backbone.table["opacity_logits"].copy_(torch.tensor([2.0, -4.5, -6.0]))
-    backbone.control.reset_opacities(backbone.table, backbone.filter)
+    backbone.control.reset_opacities(backbone.table)
     expected = torch.tensor([-4.5951199, -4.5951199, -6.0])
     torch.testing.assert_close(backbone.table["opacity_logits"].detach(), expected)
 

@@ -65,7 +65,7 @@ def sampling_scores(
     largest, smallest = torch.zeros_like(splats.scales[:, 0]), torch.full_like(splats.scales[:, 0], torch.inf)
     finest, views = torch.full_like(largest, -1, dtype=torch.long), torch.zeros_like(largest)
     for number, camera in enumerate(photographs):
-        radii = undilated_radii(splats.means, splats.scales, splats.quats, camera, raster)
+        radii = undilated_radii(splats, camera, raster)
         visible = radii >= 0
         finest[radii > largest] = number
         largest, smallest = largest.maximum(radii), torch.where(visible, smallest.minimum(radii), smallest)
@@ -120,18 +120,12 @@ def in_bytes(weights: Float[Tensor, "h w"]) -> UInt8[Tensor, "h w"]:
 
 
 @torch.no_grad()
-def undilated_radii(
-    means: Float[Tensor, "N 3"],
-    scales: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    camera: Camera,
-    settings: RasterSettings,
-) -> Float[Tensor, "N"]:
+def undilated_radii(splats: Splats, camera: Camera, settings: RasterSettings) -> Float[Tensor, "N"]:
     """Returns three standard deviations on the screen before dilation, px, not rounded; -1: outside the raster.
 
     Source: 3D-GS, forward.cu, whose floor makes all splats much thinner than a pixel alike.
     """
-    screen, on = on_screen(without_colours(means, scales, quats), camera, settings)
+    screen, on = on_screen(without_colours(splats.means, splats.scales, splats.quats), camera, settings)
     dilation, _ = settings.dilation_at(camera.focal)
-    undilated = screen.covariances[on] - dilation * means.new_tensor([1, 0, 1])
-    return torch.full_like(means[:, 0], -1).index_copy_(0, screen.ids[on], three_sigma(*undilated.unbind(1)))
+    undilated = screen.covariances[on] - dilation * splats.means.new_tensor([1, 0, 1])
+    return torch.full_like(splats.means[:, 0], -1).index_copy_(0, screen.ids[on], three_sigma(*undilated.unbind(1)))

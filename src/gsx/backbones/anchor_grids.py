@@ -97,8 +97,8 @@ class LevelGrids(VoxelGrid):
     ) -> tuple[int, int]:
         """Adds anchors in cells of each anchor's level and of the next (Octree-GS, anchor_growing)."""
         gate = self.quirks.gate == "open" or self.levels.highest(step) == self.levels.count - 1
-        options = self.options.growth
-        return LevelGrowth(table, representation, options, least, room, self.levels, self.quirks, gate).grow()
+        finest, options = self.levels.size(self.levels.count - 1), self.options.growth
+        return LevelGrowth(table, representation, options, least, room, finest, self.levels, self.quirks, gate).grow()
 
     def columns(self, table: ParameterTable) -> dict[str, Float[Tensor, "N"]]:
         """Returns levels and their bias (Octree-GS, save_ply)."""

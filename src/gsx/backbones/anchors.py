@@ -98,7 +98,7 @@ class Anchors(SceneModel):
 
     def draw(self, camera: Camera, step: int) -> DrawnAnchors:
         """Decodes the anchors that the camera draws at its distance."""
-        return self.representation.decode(self.table, self.visible(camera, step), self.filter)
+        return self.representation.decode(self.table, self.visible(camera, step))
 
     def visible(self, camera: Camera, step: int) -> VisibleAnchors:
         """Returns the anchors in view on the levels that the camera draws (Scaffold-GS; Octree-GS)."""
@@ -209,7 +209,7 @@ class Anchors(SceneModel):
             view=-1,
             sh_degree=self.sh[0],
         )
-        return self.representation.decode(self.table, every, self.filter)
+        return self.representation.decode(self.table, every)
 
     def file_columns(self) -> dict[str, Tensor]:
         """Returns the raw columns of the published file and the filter's sizes, a row per anchor (save_ply)."""

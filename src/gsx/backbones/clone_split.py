@@ -14,12 +14,11 @@ from torch import Tensor
 
 from gsx.backbones.capacity import mark_newborn, without_newborn
 from gsx.backbones.cells import pooled_max
-from gsx.backbones.density import mean_gradient, over_cap, within_room
+from gsx.backbones.density import mean_gradient, over_cap, sampled_means, within_room
 from gsx.backbones.density_control import DensityControl
 from gsx.backbones.growth_options import Quirks
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.levels import Levels, drawn, facts_of, initial_nodes, kept, note_of, thresholds, warnings_of
-from gsx.backbones.sampling import sampled_means
 from gsx.backbones.visibility import Visibility, VisibleGaussians
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud

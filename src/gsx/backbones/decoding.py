@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid, normalize
 
 from gsx.backbones.heads import Heads
-from gsx.backbones.mip import Filter
+from gsx.backbones.mip import filtered
 from gsx.core.backend import EAGER, Backend
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.gaussians.sh import colours_of, constant_from_colour
@@ -104,7 +104,7 @@ class Neural:
             "log_scales": log_lengths[:, None].repeat(1, 6),
         }
 
-    def decode(self, table: ParameterTable, visible: VisibleAnchors, filter_: Filter) -> DrawnAnchors:
+    def decode(self, table: ParameterTable, visible: VisibleAnchors) -> DrawnAnchors:
         """Decodes anchors: mu = x + O l[0:3], s = l[3:6] sigmoid, opacity tanh > 0 (Scaffold-GS)."""
         rows, k = visible.rows, self.offsets
         anchors = table["anchors"][rows]
@@ -121,7 +121,7 @@ class Neural:
         size = repeat_rows(lengths(take_rows(table["log_scales"], rows)), owner)
         shape = take_rows(shapes.reshape(-1, 7), chosen)
         scales, log_opacities = size[:, 3:] * shape[:, :3].sigmoid(), take_rows(opacities.view(-1), chosen).log()
-        scales, log_opacities = filter_.smoothed(scales, log_opacities, table, rows[owner])
+        scales, log_opacities = filtered(table, rows[owner], scales, log_opacities)
         splats = Splats(
             means=anchors[owner] + take_rows(take_rows(table["offsets"], rows).view(-1, 3), chosen) * size[:, :3],
             scales=scales,
@@ -175,7 +175,7 @@ class Explicit:
             "sh_rest": log_lengths.new_zeros(count, (self.sh_degree + 1) ** 2 - 1, 3),
         }
 
-    def decode(self, table: ParameterTable, visible: VisibleAnchors, filter_: Filter) -> DrawnAnchors:
+    def decode(self, table: ParameterTable, visible: VisibleAnchors) -> DrawnAnchors:
         """Decodes anchors: mu = x + O l[0:3], s = l[3:6], opacity sigmoid times the level's weight."""
         rows = visible.rows
         row = {name: take_rows(table[name], rows) for name in table.parameters}
@@ -184,7 +184,7 @@ class Explicit:
         weights = visible.weights.clamp_min(LEAST)
         scales, log_opacities = size[:, 3:], logsigmoid(row["opacity_logits"]) + weights.log()
         opacities = log_opacities.detach().exp()[:, None]
-        scales, log_opacities = filter_.smoothed(scales, log_opacities, table, rows)
+        scales, log_opacities = filtered(table, rows, scales, log_opacities)
         offsets = offsets_from(means, visible.camera.centre)
         splats = Splats(
             means=means,

@@ -1,15 +1,17 @@
-"""Arithmetic of adaptive density control: render statistics of each primitive, and a cap on additions.
+"""Arithmetic of adaptive density control: render statistics, a cap on additions, samples and quantiles.
 
 Statistics are sums over the renders since the last density event, weighted as in the step's loss: each of n photos of a
 step has weight 1 / n, less the share of its pseudo views. Gradients of the loss carry the same weight, so means stay
 comparable with published thresholds for any batch and augmenter.
 """
 
+import math
 import sys
 
 import torch
 from torch import Tensor
 
+from gsx.core.gaussians.quaternions import rotation_matrices
 from gsx.core.rasterizer import ScreenStatistics
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import ParameterTable
@@ -93,3 +95,17 @@ def mean_gradient(table: ParameterTable) -> Float[Tensor, "N"]:
 def mean_absolute(table: ParameterTable) -> Float[Tensor, "N"]:
     """Returns the weighted mean absolute gradient."""
     return mean_of(table.statistics["absolute"], table.statistics["count"])
+
+
+def sampled_means(rows: dict[str, Tensor], generator: torch.Generator) -> Float[Tensor, "M 3"]:
+    """Draws one position from each Gaussian of raw `means`, `quats` and `log_scales`."""
+    noise = torch.randn(rows["means"].shape, generator=generator).to(rows["means"])
+    offset = rotation_matrices(rows["quats"]) @ (noise * rows["log_scales"].exp())[:, :, None]
+    return rows["means"] + offset[:, :, 0]
+
+
+def quantile(values: Float[Tensor, "M"], fraction: float) -> float:
+    """Returns a linearly interpolated quantile (torch.quantile is limited to 2^24 values)."""
+    place = fraction * (len(values) - 1)
+    low, high = (float(values.kthvalue(rank + 1).values) for rank in (math.floor(place), math.ceil(place)))
+    return low + (high - low) * (place - math.floor(place))

@@ -9,10 +9,16 @@ from torch.nn.functional import logsigmoid
 
 from gsx.backbones.capacity import event_steps
 from gsx.backbones.capacity_options import capacity_of
-from gsx.backbones.density import mean_absolute, mean_gradient, over_cap, within_room, zero_statistics
+from gsx.backbones.density import (
+    mean_absolute,
+    mean_gradient,
+    over_cap,
+    quantile,
+    sampled_means,
+    within_room,
+    zero_statistics,
+)
 from gsx.backbones.gs3d_options import Density, GS3DOptions
-from gsx.backbones.mip import Filter
-from gsx.backbones.sampling import quantile, sampled_means
 from gsx.backbones.sky import not_sky
 from gsx.backbones.visibility import everything, extents
 from gsx.core.shapes import Bool, Float
@@ -75,9 +81,9 @@ class DensityControl:
         keep_rows(table, ~pruned)
         return int(pruned.sum())
 
-    def reset_opacities(self, table: ParameterTable, filter_: Filter) -> None:
+    def reset_opacities(self, table: ParameterTable) -> None:
         """Sets o <- min(o, reset_opacity) except for the sky (3D-GS); o includes the 3D filter (Mip-Splatting)."""
-        logits, drawn = table["opacity_logits"].detach(), extents(table, everything(table), filter_)[1].detach()
+        logits, drawn = table["opacity_logits"].detach(), extents(table, everything(table))[1].detach()
         excess = (drawn - math.log(self.options.reset_opacity)).clamp_min(0) * not_sky(table)
         lowered = torch.where(excess > 0, logit_of_log(logsigmoid(logits) - excess), logits)
         reset_column(table, "opacity_logits", lowered)

@@ -102,26 +102,28 @@ class NewAnchors:
         )
 
 
+@dataclass(eq=False)
 class Growth:
     """One event that adds anchors cell size by cell size; of all, those with the largest gradients stay."""
 
-    def __init__(
-        self,
-        table: ParameterTable,
-        representation: Representation,
-        options: GrowthOptions,
-        least: float,
-        room: int,
-        finest: float,
-    ) -> None:
-        """Finds the offsets visible in more than `least` steps; `room`: most anchors; `finest`: smallest cell."""
-        self.table, self.representation, self.options, self.room = table, representation, options, room
+    table: ParameterTable
+    representation: Representation
+    options: GrowthOptions
+    least: float
+    """Number of steps that an offset must be visible in more often."""
+    room: int
+    """Most anchors to add."""
+    finest: float
+    """Smallest cell, world units."""
+
+    def __post_init__(self) -> None:
+        table = self.table
         self.old, self.proposed, self.strengths = len(table), 0, list[Tensor]()
-        enough, self.gradient = eligible(table, least)
+        enough, self.gradient = eligible(table, self.least)
         self.row_gradient = self.gradient.sum(1) / (enough.sum(1) + 1e-6)
         reach = lengths(table["log_scales"].detach()[:, :3])
-        self.finest, self.means = finest, table["anchors"][:, None] + table["offsets"].detach() * reach[:, None]
-        self.enough = enough & (self.means.double().abs() < LARGEST_CELL * finest).all(2)
+        self.means = table["anchors"][:, None] + table["offsets"].detach() * reach[:, None]
+        self.enough = enough & (self.means.double().abs() < LARGEST_CELL * self.finest).all(2)
 
     def propose(
         self,
@@ -184,29 +186,21 @@ class DepthGrowth(Growth):
         return self.within_room()
 
 
+@dataclass(eq=False)
 class LevelGrowth(Growth):
     """Growth of Octree-GS: cells of the own level, and of the next for the largest gradients (anchor_growing)."""
 
-    def __init__(
-        self,
-        table: ParameterTable,
-        representation: Representation,
-        options: GrowthOptions,
-        least: float,
-        room: int,
-        levels: Levels,
-        quirks: Quirks,
-        gate: bool,
-    ) -> None:
-        """Finds the offsets as `Growth` does; `gate`: allow promotion and bias."""
-        super().__init__(table, representation, options, least, room, levels.size(levels.count - 1))
-        self.levels, self.quirks, self.gate = levels, quirks, gate
-        self.taus = thresholds(options.gradient, levels.fork, options.update_ratio, levels.count + 1)
+    levels: Levels
+    quirks: Quirks
+    gate: bool
+    """True: promotion and bias take place."""
 
     def grow(self) -> tuple[int, int]:
         """Adds anchors; returns (number added, number without room)."""
+        options, levels = self.options, self.levels
+        self.taus = thresholds(options.gradient, levels.fork, options.update_ratio, levels.count + 1)
         level_of = self.table["level"].clone()
-        for level in range(self.levels.count):
+        for level in range(levels.count):
             on_level = level_of == level
             if not bool(on_level.any()):
                 continue

@@ -146,7 +146,7 @@ class GS3D(SceneModel):
         """Returns the Gaussians that the camera draws, with their colours towards it."""
         visible = self.visibility.visible(self.table, camera, step)
         values = visible.values
-        scales, log_opacities = extents(self.table, visible, self.filter)
+        scales, log_opacities = extents(self.table, visible)
         offsets, degree = offsets_from(values["means"], camera.centre), self.active_degree(step)
         backend = self.raster.backend.on(scales.device.type, learning=True)
         splats = Splats(
@@ -179,7 +179,7 @@ class GS3D(SceneModel):
             if before is not None and self.filter.narrows(step):  # renders stay equal
                 absorb(self.table, before, self.table["filter"])
         if self.control.reset_due(step):
-            self.control.reset_opacities(self.table, self.filter)
+            self.control.reset_opacities(self.table)
             metrics["opacity_resets"] = 1
         if step == self.sh_step():
             metrics |= choose_sh_degrees(self, step)
@@ -223,7 +223,7 @@ class GS3D(SceneModel):
         """Returns parameters of a splat file with the 3D filter fused into scales and opacities (Mip-Splatting)."""
         raw = {name: visible.values[name].detach() for name in self.table.parameters}
         if self.filter.note or visible.weights is not None:
-            scales, log_opacities = extents(self.table, visible, self.filter)
+            scales, log_opacities = extents(self.table, visible)
             raw |= {"log_scales": scales.detach().log(), "opacity_logits": logit_of_log(log_opacities.detach())}
         raw["sh_dc"] = raw["sh_dc"][:, 0]
         raw["quats"] = normalize(raw["quats"], dim=1)

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from gsx.backbones.cells import new_cells
+from gsx.backbones.density import quantile
 from gsx.backbones.level_options import LevelOptions
-from gsx.backbones.sampling import quantile
 from gsx.core.data.camera import Camera, offsets_from
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.schedule import Schedule

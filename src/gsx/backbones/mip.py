@@ -86,16 +86,6 @@ class Filter:
         """Returns whether finer views make sizes smaller after a step, so that `absorb` is needed."""
         return False
 
-    def smoothed(
-        self,
-        scales: Float[Tensor, "M 3"],
-        log_opacities: Float[Tensor, "M"],
-        table: ParameterTable,
-        rows: Int[Tensor, "M"] | None,
-    ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
-        """Returns scales and log-opacities after the 3D filter; `rows` of the table, None: all."""
-        return scales, log_opacities
-
 
 @dataclass(frozen=True, kw_only=True)
 class ZoomedRule(Filter):
@@ -158,17 +148,6 @@ class MipFilter(Filter):
         """Stores the pseudo views of this step, if they narrow the filter."""
         self.new_views[:] = views if self.options.pseudo else []
 
-    def smoothed(
-        self,
-        scales: Float[Tensor, "M 3"],
-        log_opacities: Float[Tensor, "M"],
-        table: ParameterTable,
-        rows: Int[Tensor, "M"] | None,
-    ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
-        """Widens Gaussians by the column `filter`."""
-        sizes = table["filter"]
-        return smoothed(scales, log_opacities, sizes if rows is None else sizes[rows])
-
 
 def filter_named(
     name: str, options: MipOptions, context: BackboneContext, schedule: Schedule, density_ends: int
@@ -185,6 +164,19 @@ def checked_filter(name: str) -> None:
     """Raises ValueError for an unknown filter."""
     if name not in FILTERS:
         raise ValueError(f"backbone.filter is '{name}'; choose one of {', '.join(FILTERS)}")
+
+
+def filtered(
+    table: ParameterTable,
+    rows: Int[Tensor, "M"] | None,
+    scales: Float[Tensor, "M 3"],
+    log_opacities: Float[Tensor, "M"],
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
+    """Returns scales and log-opacities of some rows (None: all) after the table's 3D filter, if it has one."""
+    if "filter" not in table.columns:
+        return scales, log_opacities
+    sizes = table["filter"]
+    return smoothed(scales, log_opacities, sizes if rows is None else sizes[rows])
 
 
 def visible_depths(

@@ -6,7 +6,7 @@ from typing import Any
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from gsx.backbones.mip import Filter
+from gsx.backbones.mip import filtered
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud
 from gsx.core.shapes import Float, Int
@@ -35,15 +35,13 @@ def everything(table: ParameterTable) -> VisibleGaussians:
     return VisibleGaussians(values={**table.parameters, **table.columns})
 
 
-def extents(
-    table: ParameterTable, visible: VisibleGaussians, filter_: Filter
-) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
+def extents(table: ParameterTable, visible: VisibleGaussians) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M"]]:
     """Returns scales and log-opacities for drawing, after the 3D filter."""
     scales = visible.values["log_scales"].clamp(max=LARGEST_LOG_SCALE).exp()
     log_opacities = logsigmoid(visible.values["opacity_logits"])
     if visible.weights is not None:
         log_opacities = log_opacities + visible.weights.clamp_min(LEAST_WEIGHT).log()
-    return filter_.smoothed(scales, log_opacities, table, visible.rows)
+    return filtered(table, visible.rows, scales, log_opacities)
 
 
 class Visibility:

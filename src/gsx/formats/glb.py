@@ -6,19 +6,23 @@ axes below a node that turns them by 180 degrees about z into glTF's world (y up
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
+from gsx.core.data.resize import display_from_linear
 from gsx.core.errors import InputError
-from gsx.core.gaussians.sh import degree_of
+from gsx.core.gaussians.bands import BAND_0
+from gsx.core.gaussians.sh import degree_of, harmonics
 from gsx.core.shapes import Float
 from gsx.formats.arrays import Arrays, finite_rows, joined
 from gsx.formats.gltf_asset import KINDS, Asset, Entry, asset_of, entry_at, glb_of, list_in, part_of, values_of, view_of
 from gsx.formats.gltf_nodes import moved, placed_meshes
-from gsx.formats.linear_colours import srgb_of_linear
 from gsx.formats.spz import decode_spz
+from gsx.formats.turned import DIRECTIONS, spread_directions
 
 logger = logging.getLogger(__name__)
 
@@ -47,6 +51,8 @@ SMALLEST_SCALE = 1e-10
 """Scale in place of 0, whose logarithm is infinite."""
 OVERSHOOT = 1e-3
 """Rounding of opacities beyond [0, 1]."""
+CHUNK = 4096
+"""Splats whose colours are converted at a time."""
 
 
 def encode_glb(arrays: Arrays, comments: Sequence[str] = (), origin: Sequence[float] = (0.0, 0.0, 0.0)) -> bytes:
@@ -221,3 +227,36 @@ def arrays_of_attributes(found: dict[str, Float[np.ndarray, "N k"]]) -> Arrays:
         sh_dc=found[CONSTANT],
         sh_rest=np.stack(rest, 1) if rest else np.empty((len(scales), 0, 3)),
     )
+
+
+# -- linear light ------------------------------------------------------------------------------------------------------
+
+
+def srgb_of_linear(arrays: Arrays, name: str) -> Arrays:
+    """Converts colours of splats from linear light to sRGB, and logs the error with the file's name.
+
+    Exact for degree 0; higher degrees are least-squares fits over evenly spread directions. Blends of splats differ.
+    """
+    basis = basis_of(arrays.degree)
+    linear = np.concatenate([arrays.sh_dc[:, None], arrays.sh_rest], 1)
+    fit, squares, most = np.linalg.pinv(basis), 0.0, 0.0
+    coefficients = np.empty_like(linear)
+    for start in range(0, len(linear), CHUNK):
+        rows = slice(start, start + CHUNK)
+        light = torch.from_numpy(np.maximum(0.5 + basis @ linear[rows], 0))
+        colours = display_from_linear(light, limited=False).numpy()  # beyond 1 by the same formula
+        coefficients[rows] = fit @ (colours - 0.5)
+        errors = np.maximum(0.5 + basis @ coefficients[rows], 0) - colours
+        squares, most = squares + float((errors**2).sum()), max(most, float(np.abs(errors).max()))
+    rms = (squares / max(len(linear) * len(basis) * 3, 1)) ** 0.5
+    logger.warning("%s: colours are of linear light and become sRGB, each to within %.4f RMS (at most %.4f); blends of "
+                   "splats differ from those in linear light", name, rms, most)  # fmt: skip
+    return replace(arrays, sh_dc=coefficients[:, 0], sh_rest=coefficients[:, 1:])
+
+
+def basis_of(degree: int) -> Float[np.ndarray, "D B"]:
+    """Returns all harmonics up to a degree in evenly spread directions, the constant one first."""
+    if not degree:
+        return np.full((1, 1), BAND_0)
+    rest = harmonics(spread_directions(DIRECTIONS), degree).numpy()
+    return np.concatenate([np.full((len(rest), 1), BAND_0), rest], 1)

@@ -14,7 +14,6 @@ from gsx.core.files import refuse_lfs_pointer
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float
 from gsx.formats.arrays import Arrays, arrays_of, finite_rows, gaussians_from
-from gsx.formats.axes import to_training_axes
 from gsx.formats.axis_names import AUTO, CHOICES, EXAMPLES, FIXED, SPECIFIED, TRAINED
 from gsx.formats.compressed_ply import decode_compressed_ply, encode_compressed_ply
 from gsx.formats.detect import MOST_HEADER, format_of
@@ -28,6 +27,7 @@ from gsx.formats.splat import decode_splat
 from gsx.formats.spz import decode_spz, encode_spz, is_antialiased
 from gsx.formats.standard_ply import decode_standard_ply
 from gsx.formats.suffixes import SPZ_VERSIONS, STANDARD, WRITTEN, splat_file_at, suffix_of
+from gsx.formats.turned import to_training_axes
 
 logger = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ beyond degree 3, and rows with NaN or inf, are dropped. Other content raises Inp
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import torch
@@ -15,7 +15,6 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.sh import constant_from_colour
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float
-from gsx.formats.activated import activated_words
 from gsx.formats.arrays import SMALLEST_OPACITY, finite_rows
 from gsx.formats.colours import COLOUR_NAMES, colours_among, full_scale_of
 from gsx.formats.ply import header_in, vertices_of
@@ -27,6 +26,11 @@ MOST_LOGIT = 30.0
 """Logit in place of infinity (opacities 0 and 1)."""
 MOST_COEFFICIENTS = 15
 """Coefficients of degree 3, without the constant one."""
+LEAST_SPLATS = 100
+"""Least number of splats for which one of the two signs suffices."""
+SMALL = 0.7
+"""Bound of the `MOST` quantile of activated scales: as logarithms they would be splats of 1 to 2 units."""
+MOST = 0.9
 Columns = Mapping[str, np.ndarray]
 
 BAKED = "whose Gaussians a network decodes for each camera: export Gaussians (gsx export RUN FILE --bake ZOOM does)"
@@ -147,3 +151,27 @@ def higher_bands(columns: Columns) -> Float[Tensor, "N B 3"]:
         raise InputError(f"it does not number its f_rest properties from 0 to {count - 1}: export it anew")
     values = stacked(columns, *names) if names else torch.zeros(rows, 0)
     return values.view(rows, 3, count // 3).transpose(1, 2)[:, :MOST_COEFFICIENTS]
+
+
+def activated_words(gaussians: Gaussians) -> Iterator[str]:
+    """Yields a sentence if raw values look activated: all scales positive and all opacities in [0, 1].
+
+    Either may be a coincidence in small files and large scenes; for many splats one clear sign suffices.
+    """
+    count = len(gaussians.means)
+    scales, opacities = gaussians.log_scales.flatten(), gaussians.opacity_logits
+    positive = count > 0 and bool((scales > 0).all())
+    shares = count > 0 and bool(((opacities >= 0) & (opacities <= 1)).all())
+    alone = count >= LEAST_SPLATS
+    small = positive and float(scales.kthvalue(max(1, int(MOST * scales.numel()))).values) < SMALL
+    several = shares and bool((opacities != opacities[0]).any())
+    signs = []
+    if positive and (shares or (alone and small)):
+        signs.append(f"all scales are above 0 (median {float(scales.median()):.3g}), where logarithms are stored")
+    if shares and (positive or (alone and several)):
+        signs.append("all opacities are within [0, 1], where logits are stored")
+    if signs:
+        yield (
+            f"these look like activated values: {', and '.join(signs)}. They are read as logarithms and logits: "
+            "export ln(scale) and ln(opacity / (1 - opacity))"
+        )

@@ -24,7 +24,7 @@ def test_a_value_with_its_range_and_every_file_that_sets_it() -> None:
     assert list(told) == ["preset/zoom.yaml", "module/supersampling.yaml"]
     for name, (number, value) in told.items():
         assert (CONF / name).read_text().splitlines()[number - 1].split("#")[0].strip() == f"factor: {value}"
-    assert "      through a raster twice as fine, reduced as the photos were" in lines
+    assert "      render at twice the density, reduced like the photos" in lines
 
 
 def test_values_told_are_values_composed() -> None:

@@ -21,8 +21,8 @@ from gsx.experiments.run_folder.run_key import composition_key, scene_stamp
 from gsx.experiments.runs.file_axes import Fit, better, fit, in_axes_of
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import start
-from gsx.formats.axes import to_training_axes
 from gsx.formats.splat_files import SpzForm, read_splats, write_gaussians
+from gsx.formats.turned import to_training_axes
 from gsx.scenes.points import GREY
 
 

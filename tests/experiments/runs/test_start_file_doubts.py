@@ -20,8 +20,8 @@ from gsx.experiments.evaluation.remarks import remarks_of
 from gsx.experiments.runs.open import start
 from gsx.experiments.runs.render_views import file_pictures
 from gsx.experiments.runs.start_file import distance_doubts, in_view_doubts, refuse_nothing_in_view
-from gsx.formats.activated import activated_words
 from gsx.formats.splat_files import read_gaussians, write_gaussians
+from gsx.formats.standard_ply import activated_words
 
 
 def ball(count: int = 200, log_scale: float = -4.0) -> Gaussians:

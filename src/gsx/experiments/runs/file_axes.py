@@ -26,10 +26,10 @@ from gsx.experiments.runs.start_file import (
     start_doubts,
     thinned,
 )
-from gsx.formats.axes import flipped
 from gsx.formats.axis_names import FIXED, SPECIFIED, TRAINED
 from gsx.formats.origin import around
 from gsx.formats.splat_files import SplatContent, log_axes
+from gsx.formats.turned import flipped
 
 logger = logging.getLogger(__name__)
 

@@ -19,10 +19,10 @@ from gsx.core.training.backbone import Backbone, FromGaussians
 from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.overrides import key_of, quoted
 from gsx.experiments.runs.settings import Settings
-from gsx.formats.activated import activated_words
 from gsx.formats.axis_names import AUTO
 from gsx.formats.origin import NO_ORIGIN, Origin, around, in_words, rounding_at, stored_in_single
 from gsx.formats.splat_files import SplatContent, compensated, is_linear, read_splats
+from gsx.formats.standard_ply import activated_words
 from gsx.scenes.points import GREY
 
 logger = logging.getLogger(__name__)
