@@ -127,7 +127,7 @@ def decode_glb(content: bytes, name: str = "", folder: Path | None = None) -> Ar
         raise InputError(f"its scene holds no splats ({EXTENSION}), but {others} other primitives{why}. "
                          "Choose another file, or export it anew")  # fmt: skip
     if others:
-        logger.info("%s: skipping %d primitives of its scene that are no splats", name, others)
+        logger.info("%s: %d primitives of its scene are no splats, skipping them", name, others)
     arrays = joined(parts)
     if len(arrays.means) and not np.abs(arrays.means).max() <= np.finfo(np.float32).max:
         raise InputError("its splats lie beyond what 32 bits hold: export them with their transform applied")
