@@ -73,7 +73,7 @@ class Anchors(SceneModel):
         sh: tuple[int, int] = (0, 1),
     ) -> None:
         points = context.points()
-        self.options, self.representation, self.sh, self.sh_degree = options, representation, sh, sh[0]
+        self.options, self.representation, (self.sh_degree, self.sh_every) = options, representation, sh
         self.network_rates, self.context, self.volume_weight = network_rates, context, options.volume_weight
         self.numbers = {view.camera: number for number, view in enumerate(context.scene.train)}
         self.schedule = context.schedule(options.published_iterations)
@@ -106,14 +106,12 @@ class Anchors(SceneModel):
         reach = lengths(self.table["log_scales"].detach()[rows, :3])
         quats = self.representation.quats(self.table).detach()[rows]
         rows = rows[touches(self.table["anchors"][rows], reach, quats, camera, self.raster)]
-        degree, every = self.sh
-        degree = min(degree, step // max(1, self.schedule.step(every)))
         return VisibleAnchors(
             rows=rows,
             weights=weights[rows],
             camera=camera,
             view=view_number(self.numbers, self.context.views, camera, step),
-            sh_degree=degree,
+            sh_degree=self.active_degree(step),
             backend=self.raster.backend.on(weights.device.type, learning=True),
         )
 
@@ -207,7 +205,7 @@ class Anchors(SceneModel):
             weights=torch.ones_like(anchors[:, 0]),
             camera=self.context.scene.train[0].camera,
             view=-1,
-            sh_degree=self.sh[0],
+            sh_degree=self.sh_degree,
         )
         return self.representation.decode(self.table, every)
 

@@ -91,7 +91,7 @@ class GS3D(SceneModel):
         self.filter = filter_named(options.filter, options.mip, context, self.schedule, control.events.stop)
         self.raster = self.filter.rules(context.raster)
         self.absolute_gradient = options.density.absolute or self.capacity.ranked
-        self.first_degree, self.sh_degree, self.volume_weight = 0, options.sh_degree, control.volume_weight
+        self.sh_degree, self.sh_every, self.volume_weight = options.sh_degree, options.sh_every, control.volume_weight
         self.table = self.initial_table(context.points())
         self.filter.refresh(self.table, self.table["means"])
 
@@ -136,11 +136,6 @@ class GS3D(SceneModel):
                     self.table[name].copy_(value)
 
     # -- one step, in the order the trainer calls --------------------------------------------------------------
-
-    def active_degree(self, step: int) -> int:
-        """Returns the SH degree at a step (3D-GS, sh_utils.py)."""
-        grown = step // max(1, self.schedule.step(self.options.sh_every))
-        return max(self.first_degree, min(self.options.sh_degree, grown))
 
     def draw(self, camera: Camera, step: int) -> DrawnSplats:
         """Returns the Gaussians that the camera draws, with their colours towards it."""

@@ -131,8 +131,11 @@ class MipFilter(Filter):
         if options.views > 1:
             sizes = sizes / several_views(points, cameras, sizes, options)
         if options.pseudo:
-            narrow_by_pseudo_views(table, points, self.new_views, sizes, options)
-            sizes = sizes.minimum(table["earned"])
+            smallest = table.columns.get("earned", torch.full_like(sizes, torch.inf))  # by pseudo views so far
+            for view in self.new_views:
+                smallest = smallest.minimum(pseudo_view_sizes(points, view, sizes, options))
+            table.columns["earned"] = smallest
+            sizes = sizes.minimum(smallest)
         table.columns["filter"] = sizes
 
     def due(self, step: int) -> bool:
@@ -243,20 +246,6 @@ def several_views(
         depth, visible = visible_depths(points, camera, options)
         views += visible * (sizes / deviation * camera.fx / depth).square().clamp_max(1)
     return (views.sqrt() / ENOUGH_VIEWS**0.5).clamp(1, options.views)
-
-
-def narrow_by_pseudo_views(
-    table: ParameterTable,
-    points: Float[Tensor, "N 3"],
-    views: Sequence[PseudoView],
-    sizes: Float[Tensor, "N"],
-    options: MipOptions,
-) -> None:
-    """Updates the smallest sizes by pseudo views, a column of the table; infinite without one."""
-    smallest = table.columns.get("earned", torch.full_like(sizes, torch.inf))
-    for view in views:
-        smallest = smallest.minimum(pseudo_view_sizes(points, view, sizes, options))
-    table.columns["earned"] = smallest
 
 
 @torch.no_grad()

@@ -18,6 +18,7 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import BackboneContext, Drawn
 from gsx.core.training.parameter_table import Networks, ParameterTable, take_adam_step
 from gsx.core.training.pseudo_views import PseudoView
+from gsx.core.training.schedule import Schedule
 
 
 class SceneModel(ABC):
@@ -27,8 +28,14 @@ class SceneModel(ABC):
     context: BackboneContext
     capacity: Capacity
     filter: Filter
+    schedule: Schedule
     volume_weight: float
     """Weight of the mean volume of the drawn Gaussians in the loss."""
+    sh_degree: int
+    sh_every: int
+    """Published steps between SH degrees."""
+    first_degree = 0
+    """SH degree at the start."""
 
     def new_table(
         self,
@@ -48,6 +55,10 @@ class SceneModel(ABC):
         )
         self.capacity.initialise(table)
         return table
+
+    def active_degree(self, step: int) -> int:
+        """Returns the SH degree at a step (3D-GS, sh_utils.py)."""
+        return max(self.first_degree, min(self.sh_degree, step // max(1, self.schedule.step(self.sh_every))))
 
     def regulariser(self, drawn: Drawn) -> Float[Tensor, ""] | None:
         """Returns the weighted mean volume of the drawn Gaussians, 0 for none; without a weight None."""
