@@ -85,7 +85,9 @@ def finite_rows(values: Mapping[str, V], name: str) -> dict[str, V]:
     finite = np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], 0)
     if finite.all():
         return dict(values)
-    logger.warning("%s: dropping %d of %d splats with NaN or inf", name, (~finite).sum(), len(finite))
+    logger.warning(
+        "%s: %d of %d splats have values that are not finite, dropping them", name, (~finite).sum(), len(finite)
+    )
     return {key: part[finite] for key, part in values.items()}
 
 
