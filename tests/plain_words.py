@@ -72,6 +72,13 @@ def comments(source: str) -> Iterator[tuple[int, str]]:
             yield token.start[0], token.string
 
 
+def visible(page: str) -> str:
+    """Return the text of a template without scripts, styles, tags and expressions; lines stay."""
+    for hidden in (r"<(script|style)\b.*?</\1>", r"<!--.*?-->|{%.*?%}|{{.*?}}|{#.*?#}", r"<[^>]*>"):
+        page = re.sub(hidden, lambda found: "\n" * found[0].count("\n"), page, flags=re.S)
+    return page
+
+
 def found_in_source(file: Path) -> Iterator[tuple[str, int, str]]:
     """Yield kind, line and text of each find in a module of `src`."""
     source = file.read_text()
@@ -97,6 +104,9 @@ def finds() -> Iterator[tuple[str, str, int, str]]:
         for number, line in enumerate(file.read_text().splitlines(), 1):
             text = line.partition("#")[2]
             yield from (("settings", str(file.relative_to(ROOT)), number, text) for _ in DIALECT.findall(text))
+    for file in sorted(SOURCE.rglob("*.html")):
+        for number, line in enumerate(visible(file.read_text()).splitlines(), 1):
+            yield from (("messages", str(file.relative_to(ROOT)), number, line) for _ in DIALECT.findall(line))
     for file in sorted(SOURCE.rglob("*.py")):
         yield from ((kind, str(file.relative_to(ROOT)), line, text) for kind, line, text in found_in_source(file))
 

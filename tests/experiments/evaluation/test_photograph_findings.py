@@ -130,7 +130,7 @@ def test_what_is_said_of_photographs_against_the_others() -> None:
     assert [name for name, told in said.items() if told] == ["dark", "warm", "moved", "blurred", "passer-by"]
     assert said["dark"] == ["0.50 stops darker than the others: training.exposure.when=auto learns exposures"]
     assert said["warm"][0].startswith("its colours are balanced otherwise, channels by up to 0.60 stops")
-    beside = "it lies 2.5 px beside the model's render (+1.5 across, -2.0 down): "
+    beside = "it is displaced by 2.5 px from its render (+1.5 across, -2.0 down): "
     assert said["moved"] == [beside + "training.poses.when=always corrects poses"]
     assert remarks_on(findings, "never", False, True)[8] == [beside + "even with its pose corrected"]
     assert "0.40 of its neighbours' fine contrast" in said["blurred"][0]
@@ -235,14 +235,14 @@ def test_findings_lie_in_the_run_and_in_its_report(run: Run, capsys: pytest.Capt
     report = (run.folder / "report.html").read_text()
     assert "8 photographs beside what the model shows" in report
     assert report.count('alt="truth of ' + index["views"][0]["name"]) == 1
-    assert "looks again" not in report
+    assert "repeats it" not in report
     drawn = sorted(path.name for path in (run.folder / "photographs").iterdir())
     assert len(drawn) == 1 + 2 * 3
     assert main(["photographs", str(run.folder), "--worst", "1"]) == 0
     assert len(list((run.folder / "photographs").iterdir())) == 1 + 3
     index["step"] = 2
     (run.folder / "photographs" / "index.json").write_text(json.dumps(index))
-    assert "looks again" in write_report(run.folder).read_text()
+    assert "repeats it" in write_report(run.folder).read_text()
 
 
 def test_a_damaged_index_is_told_and_makes_no_run_unfinished(run: Run) -> None:

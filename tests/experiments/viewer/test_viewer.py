@@ -73,17 +73,17 @@ def test_the_photograph_lies_where_it_was_taken(run: Run) -> None:
     assert torch.allclose(photo[:, :, 10:-10], view.image(), atol=1e-5)
     assert covered[:, 10:-10].all()
     assert not covered[:, :10].any()
-    look = Look(beside="photograph", split=0.5, view=view.name)
+    look = Look(compared_with="photograph", split=0.5, view=view.name)
     shown = picture(RunModel(run), pose_at(run), look, 48)
     assert torch.allclose(shown[:, :, 24:], view.image()[:, :, 24:], atol=1e-4)
-    error = picture(RunModel(run), pose_at(run), replace(look, beside="error", split=0.0), 48)
+    error = picture(RunModel(run), pose_at(run), replace(look, compared_with="error", split=0.0), 48)
     own = picture(RunModel(run), pose_at(run), Look(), 48)
     assert torch.allclose(error, (4 * (own - view.image()).abs()).clamp(0, 1), atol=1e-3)
 
 
 def test_beside_a_zoomed_picture_stands_the_enlarged_one(run: Run) -> None:
     """At zoom 2 the other half is the middle of the x1 render at half the raster, enlarged."""
-    look = Look(zoom=2.0, beside="x1, enlarged", split=0.0)
+    look = Look(zoom=2.0, compared_with="x1, enlarged", split=0.0)
     shown = picture(RunModel(run), pose_at(run), look, 96)
     camera = camera_of(pose_at(run), 24, 2.0)
     assert camera.fy == pytest.approx(run.scene.test[0].camera.fy)

@@ -119,7 +119,7 @@ def opened(target: Path, overrides: Sequence[str], plugins: Plugins) -> tuple[Ru
                 f"{target} is at step {run.step} of {run.iterations}: `{command('resume', target)}` finishes it first"
             )
         if not run.iterations:
-            raise InputError(f"{target} judged a splat file and trained nothing: give that file, and its scene=...")
+            raise InputError(f"{target} evaluated a splat file and trained nothing. Give that file, and its scene=...")
         run.raster = as_trained(run)
         return run, settings
     words = [word for word in composition_of(target, overrides) if not word.startswith("iterations=")]
@@ -188,7 +188,7 @@ def log_result(target: Path, evaluation: dict[str, Any], record: dict[str, Any])
 
 
 def overview(target: Path, to: Path) -> Path:
-    """Writes a page with both models side by side, where a run was given; returns it, else the report."""
+    """Writes a page with both models side by side if `target` is a run; returns that page, else the report."""
     if not target.is_dir():
         return to / "report.html"
     (to / COMPARED).mkdir(exist_ok=True)

@@ -23,7 +23,7 @@ ONE_IN = 8
 FEWEST = 2
 """Fewest validation views; of fewer than three training views all validate, and all are learnt from."""
 BANDS = (0, 3, 8, 15)
-"""Coefficients beside the constant one, by degree of colour."""
+"""Coefficients without the constant one, by degree of colour."""
 
 
 def split_views(run: Run) -> tuple[list[View], list[View]]:

@@ -60,7 +60,7 @@ class Candidate:
     degree: int
     """Highest degree of colour; -1: the model has no bands of its own."""
     merging: bool
-    """Whether rows were merged with neighbours."""
+    """True if rows were merged with neighbours."""
     primitives: int
     megabytes: float
     psnr: dict[str, float]

@@ -1,1 +1,1 @@
-"""Held-out views measured, and what to know beside the figures."""
+"""Evaluation on held-out views, and remarks for the reader of its figures."""

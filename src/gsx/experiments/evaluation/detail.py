@@ -26,9 +26,9 @@ class Detail:
     """Mean squares of a picture's difference from the truth, and of the truth, by band; means over channels."""
 
     low: float
-    """Of the difference, below the Nyquist frequency of training."""
+    """Difference below the Nyquist frequency of training."""
     high: float
-    """Above it; both add up to the MSE of the window."""
+    """Difference above it; both add up to the MSE of the window."""
     recoverable: float
     """Part of `high` up to RECOVERABLE times that frequency."""
     truth_high: float

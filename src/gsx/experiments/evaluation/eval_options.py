@@ -22,13 +22,12 @@ class EvalOptions:
     tile_pixels: Annotated[int, Range(LEAST_TILE_PIXELS, 1 << 31)]
     lpips: LpipsOptions
     supersample: Annotated[int, Range(0, 16)] = 0
-    """Renders are so many times as fine as each picture and are reduced; 0: as the run was trained."""
+    """Factor by which renders are finer than each picture before they are reduced; 0: as in training."""
     colours: str = "rendered"
-    """rendered: as the model shows them; fitted: by one matrix of colours a view, which its left half is fitted by and
-    its right half judged."""
+    """rendered: as the model renders them; fitted: corrected by one colour matrix per view, fitted on its left half and
+    evaluated on its right half."""
     poses: str = "given"
-    """given: views are drawn where the scene says; aligned: where the model says that they were taken, told from their
-    left halves, and their right halves are judged."""
+    """given: poses of the scene; aligned: poses estimated with the model on left halves, evaluated on right halves."""
     flight: bool = True
     """Draw a flight into the finest detail, for the report."""
     remedy: str = ""
@@ -46,5 +45,5 @@ class EvalOptions:
 
     @property
     def right_halves(self) -> bool:
-        """Whether left halves tell something of views, and right halves alone are judged."""
+        """Returns whether left halves are used for fitting, so that right halves alone are evaluated."""
         return self.colours == "fitted" or self.poses == "aligned"

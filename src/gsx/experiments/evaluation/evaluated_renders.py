@@ -58,7 +58,7 @@ class EvaluatedRenders:
         return transform_colours(image, self.matrices[view.name]).clamp(0, 1)
 
     def evaluated_pixels(self, view: View, counted: Bool[Tensor, "H W"] | None) -> Bool[Tensor, "H W"] | None:
-        """Returns the pixels of a view that are compared, of those that count; None: all.
+        """Returns the pixels of a view that are evaluated, of those that count; None: all.
 
         Raises:
             InputError: there are none.
@@ -68,8 +68,8 @@ class EvaluatedRenders:
         right = half(view, counted, right=True)
         if not right.any():
             raise InputError(
-                f"{view.name}: its mask leaves nothing of the right half, by which pictures are compared where colours "
-                "are fitted or poses are aligned: give eval.colours=rendered eval.poses=given, or leave that view out"
+                f"{view.name}: its mask covers the whole right half, the part that is evaluated where colours are "
+                "fitted or poses aligned. Use eval.colours=rendered eval.poses=given, or leave that view out."
             )
         return right
 

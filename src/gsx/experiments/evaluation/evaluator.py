@@ -1,7 +1,7 @@
 """Evaluation on held-out views: image quality, zoomed views against true finer pixels, size and speed.
 
-Beside each zoomed figure stands the naive competitor, the x1 render resized by bicubic interpolation: a zoomed render
-that loses to it adds artefacts, not detail.
+Each zoomed figure is compared with the naive competitor, the x1 render enlarged by bicubic interpolation: a zoomed
+render that loses to it adds artefacts, not detail.
 """
 
 import statistics
@@ -32,7 +32,7 @@ from gsx.experiments.run_folder.files import DETAIL_OF
 
 
 def peak_memory_mb(device: torch.device) -> float | None:
-    """Peak memory of the GPU, or of this process on the CPU, in MB (1e6 bytes); None where Python is not told it."""
+    """Peak memory of the GPU, or of this process on the CPU, in MB (1e6 bytes); None where Python cannot ask."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 1e6
     try:
@@ -44,25 +44,25 @@ def peak_memory_mb(device: torch.device) -> float | None:
 
 
 def mean(values: Sequence[float | None]) -> float | None:
-    """Mean, or None where a value is missing."""
+    """Returns the mean, or None where a value is missing."""
     known = [value for value in values if value is not None]
     return statistics.fmean(known) if known and len(known) == len(values) else None
 
 
 def highest(values: Sequence[float | None]) -> float | None:
-    """The largest known value, or None where none is known."""
+    """Returns the largest known value, or None."""
     return max((value for value in values if value is not None), default=None)
 
 
 def group_figures(views: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-    """Means over the views of a group."""
+    """Returns means over the views of a group."""
     keys = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips", "visible_primitives": "visible"}
     return {name: mean([view[key] for view in views]) for name, key in keys.items()}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Zoomed:
-    """A view at a zoom: the truth there, the render, and the x1 render resized to it, as they are measured."""
+    """A view at a zoom: truth, render, and the x1 render enlarged, as they are measured."""
 
     view: View
     factor: float
@@ -70,34 +70,34 @@ class Zoomed:
     render: Float[Tensor, "3 H W"]
     enlarged: Float[Tensor, "3 H W"]
     photograph: Float[Tensor, "3 H W"]
-    """The truth at the training resolution, enlarged: the most that can be had without new detail."""
+    """The truth at the training resolution, enlarged: the best picture without new detail."""
     counted: Bool[Tensor, "H W"] | None = None
-    """Which pixels count, None: all; those that masks leave out are black in every picture."""
+    """Pixels that count, None: all; pixels outside of masks are black in every picture."""
 
 
 @runtime_checkable
 class Drawing(Protocol):
-    """Who draws views while their truth and renders are at hand; views are counted as in `scene.test`."""
+    """Receiver of pictures during evaluation; views are counted as in `scene.test`."""
 
     def choose(self, figures: Sequence[dict[str, Any]]) -> None:
-        """Learns the figures of all views at the training resolution, before the first is drawn."""
+        """Receives the figures of all views at the training resolution, before the first picture."""
         ...
 
     def whole(self, number: int, view: View, render: Float[Tensor, "3 H W"]) -> None:
-        """A view at the training resolution."""
+        """Receives a view at the training resolution."""
         ...
 
     def zoomed(self, number: int, zoomed: Zoomed) -> None:
-        """The same view at another zoom; all of its zooms come before the next view."""
+        """Receives the same view at another zoom; all of its zooms come before the next view."""
         ...
 
 
 Advance = Callable[[float, str], None]
-"""Told after each picture: its size in units of an x1 picture, and what it was."""
+"""Callback after each picture: its size in units of an x1 picture, and its name."""
 
 
 def silent(amount: float, part: str) -> None:
-    """Tells nobody."""
+    """Ignores progress."""
 
 
 class Evaluator:
@@ -109,31 +109,29 @@ class Evaluator:
         self.times: list[float] = []
         """Seconds of each render at the training resolution, without its way to the CPU."""
         self.kept: dict[View, Tensor] = {}
-        """Those renders, as bytes where they are quantised."""
+        """Renders at the training resolution, as bytes where they are quantised."""
 
     def measured(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-        """The picture as metrics see it."""
+        """Returns a picture as metrics get it: quantised to 8 bits if the protocol says so."""
         return quantise(image) if self.options.quantise else image
 
     def view(self, view: View) -> dict[str, Any]:
-        """Figures of one view at the training resolution."""
+        """Measures one view at the training resolution."""
         self.renders.camera(view)  # estimating it is not part of the time of a render
-        begun = time.perf_counter()
+        start = time.perf_counter()
         tiled = self.renders.render(view)
-        self.times.append(time.perf_counter() - begun - tiled.gathering)
+        self.times.append(time.perf_counter() - start - tiled.gathering)
         whole, counted = self.measured(self.renders.fit(view, tiled.image)), view.counted()
         self.kept[view] = to_uint8(whole) if self.options.quantise else whole
-        image, truth, judged = (
-            black_out(whole, counted),
-            black_out(view.image(), counted),
-            self.renders.evaluated_pixels(view, counted),
-        )
+        image, truth = black_out(whole, counted), black_out(view.image(), counted)
+        parts = self.evaluated_part(image), self.evaluated_part(truth)
+        evaluated = self.renders.evaluated_pixels(view, counted)
         return {
             "name": view.name,
             "group": view.group,
-            "psnr": psnr(image, truth, judged),
-            "ssim": self.ssim(image, truth, judged),
-            "lpips": None if self.lpips is None else self.lpips.distance(self.seen(image), self.seen(truth)),
+            "psnr": psnr(image, truth, evaluated),
+            "ssim": self.ssim(image, truth, evaluated),
+            "lpips": None if self.lpips is None else self.lpips.distance(*parts),
             "visible": int(tiled.visible.sum()),
             "left_out": tiled.dropped,
         }
@@ -141,20 +139,20 @@ class Evaluator:
     def ssim(
         self, image: Float[Tensor, "3 H W"], truth: Float[Tensor, "3 H W"], counted: Bool[Tensor, "H W"] | None
     ) -> float:
-        """By the protocol's variant, compiled if renders would be where the picture is."""
+        """Returns SSIM by the protocol's variant, compiled if renders on that device are."""
         return ssim(image, truth, self.options.ssim, counted, self.run.raster.backend.on(image.device.type))
 
-    def seen(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H w"]:
-        """The part of a picture that is judged, for metrics that know no mask."""
+    def evaluated_part(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H w"]:
+        """Returns the part of a picture that counts, for metrics without masks."""
         return image[..., image.shape[2] // 2 :] if self.options.right_halves else image
 
     def whole(self, view: View) -> Float[Tensor, "3 H W"]:
-        """The render of a view that was measured."""
+        """Returns the x1 render of a measured view."""
         kept = self.kept[view]
         return kept.float() / 255 if self.options.quantise else kept
 
     def zoomed(self, view: View, factor: float) -> Zoomed | None:
-        """A measured view at `factor` times the resolution, or None where there is no truth."""
+        """Returns a measured view at `factor` times the resolution, or None where there is no truth."""
         finer = view.zoom(factor)
         if finer is None:
             return None
@@ -172,7 +170,7 @@ class Evaluator:
         )
 
     def zoom_figures(self, zoomed: Zoomed) -> dict[str, float]:
-        """Figures of one view at a zoom, beside those of its competitors."""
+        """Measures one view at a zoom, and its competitors."""
         truth, counted = zoomed.truth, zoomed.counted
         return {
             "psnr": psnr(zoomed.render, truth, counted),
@@ -183,13 +181,13 @@ class Evaluator:
         }
 
     def work(self) -> float:
-        """What `advance` will be told in all."""
+        """Returns the sum of sizes that `advance` will receive."""
         test = self.run.scene.test
         zooms = [f for view in test for f in self.options.zoom if f != 1 and view.zoom(f) is not None]
         return len(test) + sum(factor**2 for factor in zooms)
 
     def views(self, advance: Advance = silent) -> list[dict[str, Any]]:
-        """Figures of all views at the training resolution."""
+        """Measures all views at the training resolution."""
         out = []
         for view in self.run.scene.test:
             out.append(self.view(view))
@@ -199,7 +197,7 @@ class Evaluator:
     def zooms(
         self, views: Sequence[dict[str, Any]], drawing: Drawing | None = None, advance: Advance = silent
     ) -> dict[str, dict[str, Any]]:
-        """Mean figures at each zoom, from those of `views` and of zoomed views; all of them are drawn on the way."""
+        """Returns mean figures at each zoom from those of `views` at x1; sends each picture to `drawing`."""
         if not views:
             return {f"{factor:g}": {"unavailable": NOT_MEASURED} for factor in self.options.zoom}
         found: dict[float, list[dict[str, float]]] = {factor: [] for factor in self.options.zoom}
@@ -212,9 +210,9 @@ class Evaluator:
                     figures.append({kind + key: own[key] for kind in ("", "enlarged_") for key in ("psnr", "ssim")})
                 elif zoomed := self.zoomed(view, factor):
                     figures.append(self.zoom_figures(zoomed))
-                    shown = {name: getattr(zoomed, name) for name in DETAIL_OF}
+                    pictures = {name: getattr(zoomed, name) for name in DETAIL_OF}
                     whole = zoomed.counted is None  # the border of a mask would be detail
-                    details[factor].append(details_of(shown, zoomed.truth, factor) if whole else {})
+                    details[factor].append(details_of(pictures, zoomed.truth, factor) if whole else {})
                     if drawing is not None:
                         drawing.zoomed(number, zoomed)
                     advance(factor**2, f"{view.name} x{factor:g}")
@@ -229,7 +227,7 @@ class Evaluator:
         """Return the content of evaluation.json; figures of quality are None where no view is held out.
 
         Raises:
-            InputError: of a view nothing is judged; before any is drawn.
+            InputError: a view has no pixel that counts; raised before the first picture.
         """
         if self.options.right_halves:
             for view in self.run.scene.test:
@@ -265,7 +263,7 @@ class Evaluator:
 
 
 def zoom_entry(factor: float, figures: Sequence[dict[str, float]], details: Sequence[Details]) -> dict[str, Any]:
-    """Mean figures at one zoom, with the verdict; or a reason why there are none."""
+    """Returns mean figures at one zoom with the verdict, or the reason why there are none."""
     if not figures:
         return {"unavailable": f"the images hold no truth at x{factor:g}: train on a larger scene.downscale"}
     means = {key: statistics.fmean(f[key] for f in figures) for key in figures[0]}
@@ -277,13 +275,13 @@ def zoom_entry(factor: float, figures: Sequence[dict[str, float]], details: Sequ
 
 
 def quick_psnr(run: Run, options: EvalOptions, count: int = 8) -> float:
-    """Mean PSNR over up to `count` evenly spread test views, for the curve during training."""
+    """Returns mean PSNR over up to `count` evenly spread test views, for the curve during training."""
     views = evenly(run.scene.test, count)
     renders = ((v, render(run, v.camera, options.tile_pixels).image) for v in views)
     return statistics.fmean(psnr(image, v.image(), v.counted()) for v, image in renders)
 
 
 def evenly(views: Sequence[View], count: int) -> list[View]:
-    """Up to `count` of some views, the middles of as many equal parts."""
+    """Returns up to `count` views, the middles of as many equal parts."""
     count = min(count, len(views))
     return [views[(2 * part + 1) * len(views) // (2 * count)] for part in range(count)]

@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """LPIPS input normalisation for values in [-1, 1]."""
 Layer: TypeAlias = tuple[int, int, int, int]
-"""Of a convolution: channels, kernel, stride, padding; a ReLU follows."""
+"""Convolution: channels, kernel, stride, padding; a ReLU follows."""
 VGG_WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 STAGES: dict[str, list[tuple[int, list[Layer]]]] = {
     "vgg": [(2 if n else 0, [(width, 3, 1, 1) for width in widths]) for n, widths in enumerate(VGG_WIDTHS)],

@@ -98,7 +98,7 @@ def usual(values: Sequence[float | None]) -> float:
 def remarks(
     one: Finding, stops: float, distance: float, concentration: float, psnr: float, exposure: str, pose: str
 ) -> Iterator[str]:
-    """Yields the faults of a photo, given the medians of all photos and the remedies."""
+    """Yields the faults of a photo from the medians of all photos, with their remedies."""
     if one.gains and one.stops is not None:
         brighter, balance = one.stops - stops, max(one.gains) - min(one.gains)
         if abs(brighter) > UNEVEN:
@@ -107,7 +107,7 @@ def remarks(
             yield f"its colours are balanced otherwise, channels by up to {balance:.2f} stops: {exposure}"
     if one.shift and one.distance is not None and one.distance >= max(SHIFTED, TIMES * distance):
         x, y = one.shift
-        yield f"it lies {one.distance:.1f} px beside the model's render ({x:+.1f} across, {y:+.1f} down): {pose}"
+        yield f"it is displaced by {one.distance:.1f} px from its render ({x:+.1f} across, {y:+.1f} down): {pose}"
     if one.sharpness is not None and one.sharpness < BLURRED:
         yield f"it has {one.sharpness:.2f} of its neighbours' fine contrast: blurred, leave it out or take it again"
     if one.concentrated >= max(ELSEWHERE, MORE * concentration) and one.psnr < psnr:

@@ -29,5 +29,5 @@ def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, An
     if options.poses == "aligned":
         protocol |= {"poses": "aligned to the model by the left half; all figures of the right half"}
     text = json.dumps(protocol, sort_keys=True, default=str)
-    # which zooms were looked at changes no figure, so it does not enter the hash
+    # the choice of zooms changes no figure, so it does not enter the hash
     return protocol | {"zoom": list(options.zoom), "hash": hashlib.sha256(text.encode()).hexdigest()[:16]}

@@ -1,4 +1,4 @@
-"""What a reader must know beside the figures of a run: growth held at a cap, pictures lost, splats left out."""
+"""Remarks for the reader of a run's figures: growth held at a cap, pictures lost, splats left out."""
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -12,34 +12,34 @@ from gsx.modules.catalogue import MODULES
 logger = logging.getLogger(__name__)
 
 NOT_MEASURED = "no view is held out (scene.split=none), so quality is not measured"
-"""Sentence in place of figures."""
+"""Sentence that replaces figures."""
 CHECKS = {
     "colour": "changed their mean colour",
     "agreement": "disagree with their input",
     "displacement": "are displaced",
 }
-"""What pictures did that a check has warned of."""
+"""Words for the pictures that a check warns of."""
 
 
 class CapNotice:
-    """Listener: says once that growth is held at a cap."""
+    """Listener that logs once that growth is held at a cap."""
 
     def __init__(self) -> None:
-        self.said = False
+        self.logged = False
 
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
-        """A resumed run has said it."""
-        self.said = any(line.get("withheld") for line in run.progress.curves)
+        """Learn from the metrics of a resumed run whether it was logged."""
+        self.logged = any(line.get("withheld") for line in run.progress.curves)
 
     @hookimpl
     def gsx_step_finished(self, run: Run, step: StepResult) -> None:
-        """Say it at the first step that adds fewer primitives than density control asks for."""
+        """Log the first step that adds fewer primitives than density control requests."""
         count = step.changes.get("withheld", 0)
-        if count and not self.said:
-            self.said = True
+        if count and not self.logged:
+            self.logged = True
             logger.warning(
-                "step %d: %d primitives find no room under backbone.max_primitives, which holds growth from here on: "
+                "step %d: %d primitives exceed backbone.max_primitives, which holds growth from here on: "
                 "raise it, or set it to 0 for no cap",
                 step.number,
                 count,
@@ -50,12 +50,12 @@ class CapNotice:
 
 
 def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Returns what a cap has `withheld` and what became of pictures of `pseudo` views, from lines of metrics.jsonl."""
+    """Returns counts of primitives over the cap and of pseudo views' pictures, from lines of metrics.jsonl."""
     lines = list(lines)
     held = [line for line in lines if line.get("withheld")]
     cap = {"step": held[0]["step"], "primitives": sum(line["withheld"] for line in held)} if held else {}
-    told = [entry for line in lines for entry in line.get("pseudo", {}).items()]
-    pseudo = {name: totals([facts for other, facts in told if other == name]) for name, _ in told}
+    facts_by_name = [entry for line in lines for entry in line.get("pseudo", {}).items()]
+    pseudo = {name: totals([facts for other, facts in facts_by_name if other == name]) for name, _ in facts_by_name}
     return ({"withheld": cap} if cap else {}) | ({"pseudo": pseudo} if pseudo else {})
 
 
@@ -74,29 +74,29 @@ def module_remarks(run: Run, evaluation: Mapping[str, Any]) -> dict[str, list[st
 
 
 def totals(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Pictures asked for, and shares dropped and warned of, by scale, over the events of an augmenter."""
+    """Sums requested pictures, shares dropped and shares warned of, by scale, over the events of an augmenter."""
     sums = sum_accounts(events)
-    asked = sums["asked"]
-    warned = {check: shares(counts, asked) for check, counts in sums["warned"].items()}
-    return {"asked": asked, "dropped": shares(sums["dropped"], asked), "warned": warned}
+    requested = sums["asked"]
+    warned = {check: shares(counts, requested) for check, counts in sums["warned"].items()}
+    return {"asked": requested, "dropped": shares(sums["dropped"], requested), "warned": warned}
 
 
-def shares(counts: Mapping[str, int], asked: Mapping[str, int]) -> dict[str, float]:
-    """Counts by scale as shares of what was asked for at that scale; none left out."""
-    return {scale: counts.get(scale, 0) / count for scale, count in asked.items()}
+def shares(counts: Mapping[str, int], requested: Mapping[str, int]) -> dict[str, float]:
+    """Returns counts by scale as shares of what was requested at that scale."""
+    return {scale: counts.get(scale, 0) / count for scale, count in requested.items()}
 
 
 # -- in words ----------------------------------------------------------------------------------------------------------
 
 
 def remarks_of(evaluation: Mapping[str, Any]) -> list[str]:
-    """Sentences to stand beside the figures of an evaluation.json; none for a run without incident."""
+    """Returns remarks on an evaluation.json; none for a run without incident."""
     kinds = (split_remarks, start_remarks, cap_remarks, pseudo_remarks, left_out_remarks, saved_remarks)
     return [remark for kind in kinds for remark in kind(evaluation)]
 
 
 def split_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    """Yield that nothing is held out."""
+    """Yield a remark if no view is held out."""
     if measures_nothing(evaluation):
         yield NOT_MEASURED
 
@@ -113,14 +113,14 @@ def start_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
 
 
 def cap_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    """Whether growth was held."""
+    """Yield a remark if growth was held at the cap."""
     cap = evaluation.get("withheld")
     if cap:
         yield f"growth is held at backbone.max_primitives from step {cap['step']:,} on: the model may be too small"
 
 
 def pseudo_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    """Pictures of pseudo views that were lost, or kept though they stray."""
+    """Yield remarks on pictures of pseudo views that were dropped or that a check warned of."""
     for name, facts in (evaluation.get("pseudo") or {}).items():
         for scale, share in facts["dropped"].items():
             if share > 0:
@@ -132,14 +132,14 @@ def pseudo_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
 
 
 def left_out_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    """Splats that held-out renders lack."""
+    """Yield a remark if held-out renders lack splats."""
     count = evaluation.get("left_out") or 0
     if count:
         yield f"renders leave out {count:,.1f} splats a view, whose values cannot be drawn"
 
 
 def saved_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    """Yields what the run's modules said when it was evaluated; of an older evaluation, what they say of it now."""
+    """Yields the saved remarks of the run's modules; for older evaluations, remarks computed now."""
     if "remarks" in evaluation:
         yield from map(str, evaluation["remarks"])
     else:

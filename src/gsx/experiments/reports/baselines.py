@@ -24,7 +24,7 @@ class Comparison:
     backbone: str
     augmenters: str
     options: dict[str, Any]
-    """Of its augmenters and regenerators, by dotted key."""
+    """Options of its augmenters and regenerators, by dotted key."""
     gains: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     """By zoom."""
     cost: list[float] = field(default_factory=list)

@@ -91,7 +91,7 @@ class Dot:
     text: str
     """Appears on hovering."""
     label: str
-    """Text beside points of the front."""
+    """Label of points of the front."""
     colour: int
     """Number of its style."""
     link: str = ""
@@ -105,7 +105,7 @@ class Dot:
 
 @dataclass(frozen=True, kw_only=True)
 class Label:
-    """A text beside a point: its anchored end, base line and left end, drawing units."""
+    """A point's label: its anchored end, base line and left end, drawing units."""
 
     text: str
     x: float
@@ -114,7 +114,7 @@ class Label:
     anchor: str
 
     def covers(self, other: "Label") -> bool:
-        """Tells whether two texts would overlap."""
+        """Returns whether two texts would overlap."""
         apart = self.left + LETTER * len(self.text) <= other.left or other.left + LETTER * len(other.text) <= self.left
         return abs(self.line - other.line) < LINE and not apart
 
@@ -257,7 +257,7 @@ def scatter(dots: Sequence[Dot], *, x_label: str) -> Markup:
 
 
 def labels(plot: Plot, dots: Sequence[Dot]) -> list[Label]:
-    """Places names beside points, above or below them on the side with room, as far as they cover no other."""
+    """Places names next to points, above or below on the side with room, unless they cover another."""
     placed: list[Label] = []
     for dot in dots:
         x, y, width = plot.across(dot.x), plot.down(dot.y), LETTER * len(dot.label)

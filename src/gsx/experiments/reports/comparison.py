@@ -16,7 +16,7 @@ from gsx.experiments.run_folder.shapes import is_number
 COSTS = {"primitives": ("primitives", 0), "megabytes": ("MB", 1), "seconds": ("seconds of training", 1)}
 """Costs that quality is plotted against: column, its name on the axis, decimals."""
 LABEL = 32
-"""Longest name beside a point."""
+"""Most letters of a point's label."""
 
 
 @dataclass(frozen=True, kw_only=True)

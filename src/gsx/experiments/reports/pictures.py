@@ -22,7 +22,7 @@ from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Bool, Float
 from gsx.experiments.evaluation.evaluator import Zoomed
 
-SHOWN = 6
+DRAWN_VIEWS = 6
 """Test views that are drawn."""
 PICTURE_WIDTH = 1600
 """Wider pictures are saved reduced to this, in px, since the report embeds them."""
@@ -50,11 +50,11 @@ ERROR_COLOURS = (
 
 
 class Pictures:
-    """Pictures of up to SHOWN test views and their zoomed crops, with an index (implements `evaluator.Drawing`)."""
+    """Pictures of up to DRAWN_VIEWS views and their zoomed crops, with an index (implements `evaluator.Drawing`)."""
 
     def __init__(self, folder: Path, step: int) -> None:
         self.folder, self.step = folder, step
-        self.shown: dict[int, dict[str, Any]] = {}
+        self.chosen: dict[int, dict[str, Any]] = {}
         """Index entries of the views to draw, by number."""
         self.names: dict[int, str] = {}
         """Their file names."""
@@ -71,17 +71,17 @@ class Pictures:
             return
         best, worst = extremes([figure["psnr"] for figure in figures])
         roles = {worst: "worst", best: "best"} if best != worst else {}
-        numbers = spread(len(figures), SHOWN, {best, worst})
+        numbers = spread(len(figures), DRAWN_VIEWS, {best, worst})
         keys = ("name", "group", "psnr", "ssim", "lpips")
-        self.shown = {i: {key: figures[i][key] for key in keys} | {"role": roles.get(i, "")} for i in numbers}
+        self.chosen = {i: {key: figures[i][key] for key in keys} | {"role": roles.get(i, "")} for i in numbers}
         self.names = dict(zip(numbers, file_names([figures[i]["name"] for i in numbers]), strict=True))
 
     def whole(self, number: int, view: View, render: Float[Tensor, "3 H W"]) -> None:
         """Draws truth, render and error of a view."""
-        if number not in self.shown:
+        if number not in self.chosen:
             return
         files = self.compared(self.names[number], view, render)
-        self.views.append(self.shown[number] | {"size": list(view.camera.size), "files": files})
+        self.views.append(self.chosen[number] | {"size": list(view.camera.size), "files": files})
 
     def compared(self, name: str, view: View, render: Float[Tensor, "3 H W"]) -> dict[str, str]:
         """Writes truth, render and error of a view; returns their files by kind."""
@@ -92,7 +92,7 @@ class Pictures:
 
     def zoomed(self, number: int, zoomed: Zoomed) -> None:
         """Draws the window with most detail: truth, render and the x1 render resized."""
-        if number not in self.shown:
+        if number not in self.chosen:
             return
         window = most_detailed(zoomed.truth, WINDOW, zoomed.counted)
         inside = None if zoomed.counted is None else window.cut(zoomed.counted[None])[0]

@@ -69,8 +69,8 @@ def report_on(folders: Sequence[Path], to: Path | None = None) -> Path:
     Raises:
         InputError: one of the folders holds no run, or there is no sensible place for the page.
     """
-    chosen, asked = runs_in(folders), {folder.resolve() for folder in folders}
-    if to is None and asked == {run.resolve() for run in chosen} and len(chosen) == 1:
+    chosen, requested = runs_in(folders), {folder.resolve() for folder in folders}
+    if to is None and requested == {run.resolve() for run in chosen} and len(chosen) == 1:
         return write_report(folders[0])
     if to is not None and (to / "config.yaml").is_file():
         raise InputError(f"{to} is a run, whose report.html this would replace: choose another folder with --to FOLDER")

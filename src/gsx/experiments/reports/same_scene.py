@@ -25,7 +25,7 @@ def number_namesakes(runs: Sequence[RunFiles]) -> list[RunFiles]:
 
 
 def differ(run: RunFiles, other: RunFiles) -> bool:
-    """Tells whether scenes in different folders have other pixels in a test photo of one name and size."""
+    """Returns whether scenes in different folders have other pixels in a test photo of one name and size."""
     if part(run.config, "scene").get("path") == part(other.config, "scene").get("path"):
         return False
     truths, others = truths_of(run), truths_of(other)
@@ -42,7 +42,7 @@ def truths_of(run: RunFiles) -> dict[tuple[str, str], Path]:
 
 
 def unlike(one: Path, other: Path) -> bool:
-    """Tells whether two picture files have other pixels; False where one cannot be read."""
+    """Returns whether two picture files have other pixels; False where one cannot be read."""
     try:
         return one.read_bytes() != other.read_bytes() and not torch.equal(read_image(one), read_image(other))
     except (OSError, GsxError):

@@ -26,7 +26,7 @@ TEMPLATE = "viewer_page.html.xz"
 PLACE = '"GSX_BOOTSTRAP"'
 """Place of settings and splats (scripts/viewer_template.py)."""
 NAME = "model.compressed.ply"
-"""File name that tells the viewer the format."""
+"""File name whose suffix selects the viewer's decoder."""
 VIEWER_FROM_FILE = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
 """The viewer turns files by half a turn about z, and has y up."""
 LEAST_LEVEL = 0.97

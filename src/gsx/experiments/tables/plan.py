@@ -29,7 +29,7 @@ class Experiment:
     published: str
     """The paper's table, a file of conf/published; empty: there is none."""
     datasets: list[str]
-    """Of conf/dataset; dataset=NAME on the command line takes their place."""
+    """Names of conf/dataset; dataset=NAME on the command line replaces them."""
     baseline: str
     """Row that gains are over."""
     rows: dict[str, str]
@@ -37,7 +37,7 @@ class Experiment:
     quoted: dict[str, str] = field(default_factory=dict)
     """Reasons of rows that are not run."""
     overrides: list[str] = field(default_factory=list)
-    """Of every run."""
+    """Overrides of every run."""
     seeds: Annotated[list[int], Range(0, LARGEST_SEED)] = field(default_factory=lambda: [0])
     only: list[str] = field(default_factory=list)
     """Rows that are run; empty: all."""
@@ -128,7 +128,7 @@ class Plan:
     steps: int
     """Steps of the runs to be started."""
     shared: int
-    """Of these, steps that are not taken again."""
+    """Steps among these that are shared with other runs."""
 
 
 def cells_of(
@@ -154,7 +154,7 @@ def cells_of(
                     overrides = [f"dataset={name}", *words_of(what), *experiment.overrides, *words(what)]
                     overrides += [f"dataset.scene={scene}", f"seed={seed}", "reuse=true"]
                     settings = compose(overrides)
-                    options = str(settings.resolved["scene"])  # folders may be large: each is looked at once
+                    options = str(settings.resolved["scene"])  # folders may be large: read each once
                     stamps[options] = stamps.get(options) or scene_stamp(settings.resolved)
                     yield Cell(
                         row=row,

@@ -1,4 +1,4 @@
-"""How compositions differ from the paper's protocol."""
+"""Differences between compositions and the paper's protocol."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -8,7 +8,7 @@ from gsx.experiments.run_folder.run_key import NAMES, WHERE, comparable, used_re
 
 PLACES = ("model", "revision", "variant", "dtype", "tiling")
 """Keys of regenerators that say where a model comes from and how it fits into memory."""
-SHOWN_KEYS = 12
+LISTED_KEYS = 12
 """Differences from the paper's protocol that are listed."""
 
 
@@ -25,8 +25,8 @@ def protocol_differences(compared: Sequence[tuple[dict[str, Any], dict[str, Any]
     for key in sorted(found, key=lambda key: -len(found[key])):
         ours, theirs = (", ".join(dict.fromkeys(values)) for values in zip(*found[key], strict=True))
         lines.append(f"{key}={ours} (paper: {theirs})")
-    more = [f"and {len(lines) - SHOWN_KEYS} more"] if len(lines) > SHOWN_KEYS else []
-    return lines[:SHOWN_KEYS] + more
+    more = [f"and {len(lines) - LISTED_KEYS} more"] if len(lines) > LISTED_KEYS else []
+    return lines[:LISTED_KEYS] + more
 
 
 def differing(own: dict[str, Any], paper: dict[str, Any], idle: frozenset[str]) -> Iterator[tuple[str, str, str]]:

@@ -107,9 +107,9 @@ class Table:
     """Differences from the paper's protocol."""
     notes: list[str]
     seconds: float
-    """Of training, as far as it was taken."""
+    """Seconds of training."""
     saved: float
-    """Of training that was not taken again, since runs branched."""
+    """Seconds of training that runs shared by branching."""
     states: dict[str, int] = field(default_factory=dict)
     """Runs by state."""
 

@@ -125,9 +125,9 @@ def as_text(table: Table) -> str:
 
 def title_of(scope: Scope) -> str:
     """Returns the title of a scope, and the paper's where that is another one."""
-    beside = f", beside {scope.paper} in the paper" if scope.paper and scope.paper != scope.title else ""
+    paper = f", {scope.paper} in the paper" if scope.paper and scope.paper != scope.title else ""
     count = f" ({len(scope.scenes)} scenes)" if len(scope.scenes) > 1 else ""
-    return f"{scope.title}{count}{beside}"
+    return f"{scope.title}{count}{paper}"
 
 
 def aligned(grid: Sequence[Sequence[str]]) -> list[str]:

@@ -26,18 +26,18 @@ from gsx.experiments.run_folder.shapes import is_number
 OWN = "gsx_camera_path"
 MOST_FRAMES = 100_000
 LARGEST_EDGE = 16_384
-"""Of pictures, px."""
+"""Longest side of pictures, px."""
 VERSION = 1
-"""Of files of ours."""
+"""Version of our files."""
 LEAST_VOLUME = 0.99
-"""Of the box that a rotation's axes span, which is 1: nerfstudio rounds them."""
+"""Least volume of the box that a rotation's axes span: 1, but nerfstudio rounds them."""
 PARALLEL = 1e-6
 """Quaternions this near to each other are interpolated along the chord."""
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """Where a camera is at some time."""
+    """Camera pose at a time."""
 
     time: float
     """Seconds."""

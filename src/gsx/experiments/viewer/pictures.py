@@ -18,7 +18,7 @@ from gsx.core.training.run import Run
 from gsx.experiments.viewer.camera_path import posed
 from gsx.formats.origin import NO_ORIGIN, Origin
 
-BESIDE = ("nothing", "photograph", "error", "x1, enlarged")
+COMPARED_WITH = ("nothing", "photograph", "error", "x1, enlarged")
 """Right part of the picture: the photo of the view that the user jumped to, the error of the render, or the same
 camera at the resolution of the photos, enlarged."""
 FILTERS = ("as trained", "plain 3D-GS", "compensated")
@@ -45,7 +45,7 @@ class Look:
     """Settings of the picture in a panel."""
 
     zoom: float = 1.0
-    beside: str = "nothing"
+    compared_with: str = "nothing"
     split: float = 0.5
     """Share of the width at which the right picture begins."""
     filter: str = "as trained"
@@ -77,8 +77,8 @@ class RunModel:
     def drawn(self, camera: Camera, look: Look) -> Float[Tensor, "3 H W"]:
         """Renders the model alone."""
         splats = splats_for(self.run, camera.zoom(2.0**look.finer_levels))
-        shown = inside(splats, self.middle(), look.box * self.run.scene.extent) if look.box < 1 else splats
-        return render(replace(self.run, raster=filtered(self.run.raster, look.filter)), camera, splats=shown).image
+        rendered = inside(splats, self.middle(), look.box * self.run.scene.extent) if look.box < 1 else splats
+        return render(replace(self.run, raster=filtered(self.run.raster, look.filter)), camera, splats=rendered).image
 
     def middle(self) -> Float[Tensor, "3"]:
         """Returns the median of the initial points, or of the cameras."""
@@ -119,9 +119,9 @@ class FileModel:
     def drawn(self, camera: Camera, look: Look) -> Float[Tensor, "3 H W"]:
         """Renders the model alone, over black."""
         splats = splats_of(self.gaussians, camera.centre)
-        shown = inside(splats, self.middle(), look.box * self.reach()) if look.box < 1 else splats
+        rendered = inside(splats, self.middle(), look.box * self.reach()) if look.box < 1 else splats
         raster = filtered(self.raster, look.filter)
-        return rasterize_tiled(shown, camera, raster, background=torch.zeros(3)).image.clamp_(0, 1)
+        return rasterize_tiled(rendered, camera, raster, background=torch.zeros(3)).image.clamp_(0, 1)
 
     def reach(self) -> float:
         """Returns the 0.9 quantile of distances from the middle."""
@@ -156,15 +156,15 @@ def inside(splats: Splats, middle: Float[Tensor, "3"], reach: float) -> Splats:
 def picture(model: Model, pose: Pose, look: Look, width: int) -> Float[Tensor, "3 H W"]:
     """Renders the picture for a browser."""
     camera = camera_of(pose, width, look.zoom)
-    shown = model.drawn(camera, look)
-    if look.beside == "x1, enlarged":
-        return split(shown, enlarged(model, pose, look, shown), look.split)
-    view = model.views().get(look.view) if look.beside != "nothing" else None
+    rendered = model.drawn(camera, look)
+    if look.compared_with == "x1, enlarged":
+        return split(rendered, enlarged(model, pose, look, rendered), look.split)
+    view = model.views().get(look.view) if look.compared_with != "nothing" else None
     if view is None:
-        return shown
-    photo, covered = placed(view.image().to(shown), view.camera, camera)
-    other = photo if look.beside == "photograph" else (ERROR_GAIN * (photo - shown).abs()).clamp_(0, 1)
-    return split(shown, torch.where(covered, other, shown), look.split)
+        return rendered
+    photo, covered = placed(view.image().to(rendered), view.camera, camera)
+    other = photo if look.compared_with == "photograph" else (ERROR_GAIN * (photo - rendered).abs()).clamp_(0, 1)
+    return split(rendered, torch.where(covered, other, rendered), look.split)
 
 
 def split(left: Float[Tensor, "3 H W"], right: Float[Tensor, "3 H W"], at: float) -> Float[Tensor, "3 H W"]:

@@ -46,7 +46,7 @@ class Screen:
     drawn: tuple[Pose, Look, int] | None = None
     """Pose, look and version of the model of the last picture."""
     width: int = 0
-    """Of the last picture, px."""
+    """Width of the last picture, px."""
     rate: float = 0.0
     """Pictures a second while one moved, lately."""
 
@@ -107,11 +107,11 @@ class FrameServer:
     def draw(self, screen: Screen, width: int) -> None:
         """Draws and sends one picture, and updates the estimate of its time."""
         assert screen.pose is not None
-        state, begun = (screen.pose, screen.look, self.version), time.monotonic()
+        state, start = (screen.pose, screen.look, self.version), time.monotonic()
         moving = screen.drawn is not None and screen.drawn[0] != screen.pose
         with logged_errors("a picture for a browser failed"), torch.no_grad():
             screen.show(picture(self.model, screen.pose, screen.look, width))
-        taken = max(time.monotonic() - begun, 1e-6)
+        taken = max(time.monotonic() - start, 1e-6)
         self.spent += taken
         pixels = width * max(1, round(width * screen.pose.height / screen.pose.width))
         self.seconds_per_pixel += 0.3 * (taken / pixels - self.seconds_per_pixel)

@@ -24,7 +24,7 @@ from gsx.core.gaussians.quaternions import quaternions_of
 from gsx.core.packages import require
 from gsx.core.shapes import Float
 from gsx.experiments.viewer.camera_path import CameraPath, Keyframe, write_camera_path
-from gsx.experiments.viewer.pictures import BESIDE, FILTERS, Model, Pose, RunModel, picture
+from gsx.experiments.viewer.pictures import COMPARED_WITH, FILTERS, Model, Pose, RunModel, picture
 from gsx.experiments.viewer.screens import FrameServer, Screen
 from gsx.experiments.viewer.up_direction import upright
 from gsx.formats.origin import Origin
@@ -153,8 +153,9 @@ class Panel:
             cameras = gui.add_checkbox("show cameras", False, visible=bool(names))
             cameras.on_update(lambda _: self.show_cameras(cameras.value))
             self.slider("zoom", "zoom", 1.0, 8.0, 0.1, 1.0)
-            beside = gui.add_dropdown("beside", BESIDE if names else [BESIDE[0], BESIDE[3]])
-            beside.on_update(lambda _: self.choose(beside=beside.value))
+            choices = COMPARED_WITH if names else (COMPARED_WITH[0], COMPARED_WITH[3])
+            compared = gui.add_dropdown("compare with", choices)
+            compared.on_update(lambda _: self.choose(compared_with=compared.value))
             self.slider("begins at", "split", 0.0, 1.0, 0.01, 0.5)
         with gui.add_folder("model", expand_by_default=False):
             filters = gui.add_dropdown("filter", FILTERS)
