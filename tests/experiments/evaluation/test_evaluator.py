@@ -218,7 +218,7 @@ def test_a_view_of_which_nothing_would_be_judged_is_refused_by_name(tmp_path: Pa
     view = run.scene.test[0]
     left = torch.zeros(view.camera.height, view.camera.width, dtype=torch.bool)
     left[:, : view.camera.width // 2] = True
-    with pytest.raises(InputError, match=f"{view.name}: its mask leaves nothing of the right half"):
+    with pytest.raises(InputError, match=f"{view.name}: its mask covers the whole right half"):
         Evaluator(run, options).renders.evaluated_pixels(view, left)
     left[0, -1] = True
     assert Evaluator(run, options).renders.evaluated_pixels(view, left).sum() == 1
