@@ -184,7 +184,7 @@ def test_the_photographs_that_a_model_did_not_take_are_named(run: Run) -> None:
     assert {name for name, one in found.items() if one.remarks} == {dark.name, shifted.name, covered.name}
     assert dark.gains == pytest.approx((-1, -1, -1), abs=0.05)
     assert shifted.shift == pytest.approx((2, 0), abs=0.1)
-    assert (dark.remarks[0][:24], shifted.remarks[0][:16]) == ("1.00 stops darker than t", "it lies 2.0 px b")
+    assert (dark.remarks[0][:24], shifted.remarks[0][:25]) == ("1.00 stops darker than t", "it is displaced by 2.0 px")
     assert "of its error lies in" in covered.remarks[0]
     assert covered.concentrated > 0.95
     names = [one.name for one in found.values()]
