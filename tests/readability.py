@@ -1,7 +1,7 @@
 """Sentence lengths and Flesch Reading Ease of pages: `python tests/readability.py [PAGE ...]`.
 
 Reading ease = 206.835 - 1.015 words per sentence - 84.6 syllables per word (Flesch 1948); syllables are groups of
-vowels, less a silent e at the end.
+vowels, less a silent e at the end (but not that of table).
 """
 
 import re
@@ -40,7 +40,7 @@ def sentences(page: str) -> list[str]:
 def syllables(word: str) -> int:
     """Return the number of vowel groups, at least one; a final silent e does not count."""
     groups = len(re.findall(r"[aeiouy]+", word.lower()))
-    return max(1, groups - (word.lower().endswith("e") and not word.lower().endswith("le")))
+    return max(1, groups - bool(re.search(r"(?<![^aeiouy]l)(?<![aeiouy])e$", word.lower())))
 
 
 def length(sentence: str) -> int:

@@ -2,9 +2,12 @@
 
 import ast
 import json
+import statistics
 
 import pytest
+from pages import PAGES
 from plain_words import COUNTS, DIALECT, FRAGMENT, counts, docstrings, messages, names, prose
+from readability import length, reading_ease, sentences, syllables
 
 
 def test_dialect_only_becomes_less() -> None:
@@ -29,3 +32,17 @@ def test_words_are_read_where_they_stand() -> None:
     assert [node.value for node in messages(tree)] == ["is given"]
     assert sorted(name for _, name in names(tree)) == ["f", "shown", "told"]
     assert prose("told\n```\nshown\n```\n`seen` [asked](given.md)") == "told\n\n\n\n`` [asked]"
+
+
+def test_sentences_of_pages_are_short() -> None:
+    """The median has at most 18 words, the longest 40; tables, code and headings do not count."""
+    lengths = {page.name: [length(sentence) for sentence in sentences(page.read_text())] for page in PAGES}
+    assert {name: max(each) for name, each in lengths.items() if max(each, default=0) > 40} == {}
+    assert statistics.median(number for each in lengths.values() for number in each) <= 18
+
+
+def test_sentences_are_counted_as_a_reader_does() -> None:
+    page = "# A heading\n\nOne two three. Four five,\nsix seven!\n\n* eight nine ten\n\n| a | table |\n"
+    assert sentences(page) == ["One two three.", "Four five, six seven!", "eight nine ten"]
+    assert [syllables(word) for word in ("scale", "table", "render", "the")] == [1, 2, 2, 1]
+    assert reading_ease("One two three four.") == pytest.approx(206.835 - 1.015 * 4 - 84.6)
