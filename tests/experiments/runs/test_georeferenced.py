@@ -161,8 +161,8 @@ def test_gsx_export_reads_its_file_again(
     run, _ = far
     for name, words in (("a.ply", []), ("b.ply", ["--local"]), ("c.glb", []), ("d.spz", ["--local"])):
         assert main(["export", str(run.folder), str(tmp_path / name), *words]) == 0
-        told = next(line for line in capsys.readouterr().err.splitlines() if "rendered again" in line)
-        loss = float(told.split("rendered again: ")[1].split()[0])
+        told = next(line for line in capsys.readouterr().err.splitlines() if "read back and rendered" in line)
+        loss = float(told.split("rendered: ")[1].split()[0])
         assert loss > (30 if name == "d.spz" else 90), told
 
 
