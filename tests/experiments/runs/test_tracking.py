@@ -113,7 +113,7 @@ def test_a_tracker_hears_every_event_after_the_files_have_it(tmp_path: Path) -> 
 
 def test_the_tracker_of_the_documentation_works(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "how-to" / "write-a-plugin.md").read_text()
-    code = re.search(r"## A tracker\n[^\n]*\n\n((?:    [^\n]*\n|\n)+)", text)
+    code = re.search(r"## A tracker\n\n[^\n]*\n\n((?:    [^\n]*\n|\n)+)", text)
     module: dict[str, Any] = {"dataclass": dataclass, "hookimpl": hookimpl}
     exec(textwrap.dedent(code.group(1)), module)
     plugin = type("Documented", (), {"gsx_register": staticmethod(module["gsx_register"])})()
