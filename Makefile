@@ -47,9 +47,9 @@ test-faults-short: $(READY_DEV)
 test-times: $(READY_DEV)
 	$(PYTEST) --file-times
 
-# The documentation as a site; links that lead nowhere are errors.
+# The documentation as a site; links that lead nowhere are errors (with --quiet they would not be counted).
 site: $(READY_DEV)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 lint: $(READY_DEV) site
 	$(BIN)/ruff check .
