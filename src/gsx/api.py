@@ -47,7 +47,7 @@ from gsx.formats.axis_names import AUTO, SPECIFIED
 from gsx.formats.origin import NO_ORIGIN
 from gsx.formats.splat_files import SpzForm, read_around
 from gsx.formats.suffixes import SPZ_VERSIONS, splat_file_at
-from gsx.scenes.origin import moved
+from gsx.scenes.origin import relative_camera
 
 __all__ = ["SplatFile", "TrainedRun", "load", "show_messages", "train", "write_image"]
 
@@ -156,7 +156,7 @@ class SplatFile:
             raise InputError(f"background is {background!r}: give three values, red, green and blue") from error
         if not bool(((over >= 0) & (over <= 1)).all()):  # nor is nan
             raise InputError(f"background is {background!r}: give red, green and blue in [0, 1]")
-        return render_gaussians(self.gaussians, moved(camera_of(seen), self.origin), self.raster, over)
+        return render_gaussians(self.gaussians, relative_camera(camera_of(seen), self.origin), self.raster, over)
 
     def __repr__(self) -> str:
         return f"<{len(self.gaussians.means):,} splats of {self.path}>"

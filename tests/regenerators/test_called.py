@@ -88,7 +88,7 @@ def test_code_that_a_folder_names_runs_only_where_it_is_trusted(
     sys.modules.pop("theirs")
     (tmp_path / "was_here").unlink()
     assert main(["resume", str(tmp_path / "run")]) == 2
-    assert "runs code, regenerator.upscale: 'theirs:blocks'" in capsys.readouterr().err
+    assert "runs code with your permissions, regenerator.upscale: 'theirs:blocks'" in capsys.readouterr().err
     assert main(["resume", str(tmp_path / "run"), "regenerator.upscale.arguments={a: 'theirs:blocks2'}"]) == 2
     assert "runs code" in capsys.readouterr().err
     assert not (tmp_path / "was_here").exists()

@@ -24,7 +24,6 @@ from gsx.builtin import plugins
 from gsx.cli.dispatch import main
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import as_blocks
-from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError, InputError, TrainingError
 from gsx.core.training.parameter_table import table_tensors
 from gsx.core.training.regenerator import RegeneratorContext, Request
@@ -33,8 +32,8 @@ from gsx.experiments.runs.open import open_run
 from gsx.regenerators.diffusion.cascade import Cascade
 from gsx.regenerators.diffusion.model_specs import SD_X2_LATENT, SD_X4, SDXL_TURBO, Batch, ModelSpec, steps_for
 from gsx.regenerators.diffusion.options import DiffusionOptions
-from gsx.regenerators.diffusion.redraw import Diffusion, PaddedImage, any_pipeline, content_of
-from gsx.regenerators.diffusion.sizes import grown
+from gsx.regenerators.diffusion.redraw import Diffusion, any_pipeline
+from gsx.regenerators.diffusion.sizes import padded_to
 from gsx.regenerators.diffusion.tuning import closest
 
 pytestmark = [
@@ -182,7 +181,7 @@ def test_pictures_grow_to_what_a_model_takes_and_keep_every_pixel(
 ) -> None:
     """With no more than half of the addition on the upper left."""
     image = noise(*size)
-    larger, inside = grown(image, multiple, least)
+    larger, inside = padded_to(image, multiple, least)
     assert torch.equal(inside.cut(larger), image)
     for side, before in zip(larger.shape[1:], size, strict=True):
         assert side % multiple == 0
@@ -193,7 +192,7 @@ def test_pictures_grow_to_what_a_model_takes_and_keep_every_pixel(
 def test_what_is_added_is_the_picture_reflected() -> None:
     """0 1 2 becomes 2 1 | 0 1 2 | 1 0 1: the edge is not repeated, and it goes on beyond the picture's length."""
     row = torch.tensor([0.0, 1.0, 2.0]).expand(3, 1, 3)
-    larger, inside = grown(row, 8, 8)
+    larger, inside = padded_to(row, 8, 8)
     assert (inside.left, inside.top) == (2, 3)
     assert larger[0, 0].tolist() == [2, 1, 0, 1, 2, 1, 0, 1]
 
@@ -353,12 +352,11 @@ def test_scales_out_of_reach_are_refused(name: str, scales: list[int], complaint
 
 def test_flat_pictures_of_other_shapes_are_not_taken_for_one_another() -> None:
     low, wide = (
-        PaddedImage(number=0, image=torch.ones(3, *size), inside=Window(left=0, top=0, width=8, height=8),
-                    request=request(torch.ones(3, 8, 8), 2), reference=None)
+        Batch(images=torch.ones(2, 3, *size), prompts=["sharp"] * 2, seeds=[22, 23], strength=0.06)
         for size in ((16, 24), (24, 16))
-    )  # fmt: skip
-    assert content_of(low) != content_of(wide)
-    assert content_of(low) == content_of(replace(low, number=3))
+    )
+    assert low.contents() != wide.contents()
+    assert low.contents()[0] != low.contents()[1]
 
 
 def test_one_step_is_executed_at_every_strength() -> None:
@@ -424,7 +422,7 @@ def test_any_pipeline_is_called_as_its_options_say(models: dict[str, Path], tmp_
 @pytest.mark.parametrize("name", ["num_inference_steps", "guidance_scale"])
 def test_arguments_that_are_given_already_are_refused_at_once(name: str) -> None:
     words = ["regenerator/upscale=diffusers_pipeline", f"+regenerator.upscale.arguments.{name}=2"]
-    with pytest.raises(ConfigError, match=f"arguments may not hold {name}: gsx gives them itself"):
+    with pytest.raises(ConfigError, match=f"arguments may not hold {name}: gsx sets them"):
         compose([*words, "regenerator.upscale.model=m"], plugins())
 
 
@@ -484,7 +482,7 @@ def test_a_pipeline_is_shown_the_photograph_of_the_training_view() -> None:
         ("custom=pipeline", "ending in .py"),
         ("custom=nowhere.py", "there is no file custom=nowhere.py"),
         ("+arguments.prompt=sharp", "may not hold prompt"),
-        ("steps=0", "steps must be at least 1"),
+        ("steps=0", "steps is 0; give a number from 1"),
         ("dtype=half", "dtype is 'half'"),
         ("offload=all", "offload is 'all'"),
     ],
@@ -722,14 +720,14 @@ def test_a_damaged_adapter_is_named(
 def test_an_adapter_of_another_model_is_not_merged(
     pairs: list[tuple[Tensor, Tensor]], models: dict[str, Path], tmp_path: Path
 ) -> None:
-    """A run goes on with what it was begun with."""
+    """A run continues with the model with which it began."""
     few = [*TUNING, "regenerator.restore.tuning.steps=2", "regenerator.restore.tuning.crops=4"]
     Diffusion(SDXL_TURBO, options_of("sdxl_turbo", *few, model=models["useful"])).prepare(context_for(tmp_path, pairs))
     for other in (
         options_of("sdxl_turbo", *few, model=models["still"]),
         options_of("sdxl_turbo", *few, "regenerator.restore.tuning.rank=2", model=models["useful"]),
     ):
-        with pytest.raises(TrainingError, match="go on with those that the run was begun with"):
+        with pytest.raises(TrainingError, match="use those with which the run began"):
             Diffusion(SDXL_TURBO, other).prepare(context_for(tmp_path, pairs))
 
 

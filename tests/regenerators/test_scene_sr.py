@@ -157,7 +157,7 @@ def test_a_damaged_file_is_learnt_again(tmp_path: Path, caplog: pytest.LogCaptur
     photos = [view.image() for view in context_for(tmp_path).views]
     kept_at(options(steps=5), photos, BOX, 0, CPU).write_bytes(b"no network")
     assert "loss" in again.prepare(context_for(tmp_path))
-    assert "made again" in caplog.text
+    assert "computing it again" in caplog.text
     given = request(stripes(3, 12).float() / 255)
     assert torch.equal(first.regenerate([given])[0], again.regenerate([given])[0])
 

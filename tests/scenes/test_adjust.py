@@ -107,13 +107,13 @@ def test_models_of_few_observations_tell_nothing(tmp_path: Path, monkeypatch: py
     write_scene(zoomed(synthesize(), 1.01), tmp_path)
     assert shift_of(read_model(tmp_path / "sparse/0")) is None
     notes = load(colmap_options(tmp_path, adjust="auto")).notes
-    assert notes[0] == "Nothing is adjusted: too few observations tell (scene.adjust=auto)."
+    assert notes[0] == "Nothing is adjusted: too few observations (scene.adjust=auto)."
 
 
 def test_what_fits_is_left_alone_bit_for_bit(tmp_path: Path, cache: Path) -> None:
     write_scene(synthesize(), tmp_path)
     given, asked = load(colmap_options(tmp_path)), load(colmap_options(tmp_path, adjust="auto"))
-    assert asked.notes[0].startswith("Nothing is adjusted: pictures lie 0.00 px beside")
+    assert asked.notes[0].startswith("Nothing is adjusted: pictures are 0.00 px off")
     for one, other in zip(given.train, asked.train, strict=True):
         assert one.camera.draws_as(other.camera)
     assert torch.equal(given.points.positions, asked.points.positions)
@@ -127,7 +127,7 @@ def test_poses_and_focal_lengths_come_back(tmp_path: Path, disturb: Any) -> None
     write_scene(disturb(synthesize()), tmp_path / "wrong")
     truth, wrong = load(colmap_options(tmp_path / "exact")), load(colmap_options(tmp_path / "wrong"))
     mended = load(colmap_options(tmp_path / "wrong", adjust="auto"))
-    assert "then pictures lie 0.00 px beside" in mended.notes[0]
+    assert "then pictures are 0.00 px off" in mended.notes[0]
     assert mended.provenance["adjust"] == "auto"
     assert mended.train[0].camera.fx == pytest.approx(PINHOLE[0], rel=1e-4)
     error, before = (beside(scene, truth) for scene in (mended, wrong))
@@ -139,7 +139,7 @@ def test_distortion_is_found_where_cameras_do_not_fit_without(tmp_path: Path) ->
     bent = synthesize("OPENCV", (*(10 * x for x in PINHOLE), 0.2, 0.0, 0.0, 0.0), frames=8, size=(640, 480))
     write_scene(straightened(bent), tmp_path)
     scene = load(colmap_options(tmp_path, adjust="auto", max_reprojection_px=20))
-    assert "lenses of 1 cameras were bent" in scene.notes[0]
+    assert "1 cameras got distortion" in scene.notes[0]
     assert any("OPENCV cameras of 640x480 are undistorted" in note for note in scene.notes)
 
 
@@ -192,7 +192,7 @@ def test_other_poses_are_adjusted_anew(tmp_path: Path, cache: Path) -> None:
 def test_the_remedy_is_named_where_cameras_do_not_fit(tmp_path: Path) -> None:
     write_scene(zoomed(synthesize(), 1.5), tmp_path)
     refused(r"scene\.adjust=auto", load, colmap_options(tmp_path))
-    assert any("px beside what cameras observed: scene.adjust=auto" in line for line in FORMAT.facts(tmp_path))
+    assert any("px off the cameras' observations: scene.adjust=auto" in line for line in FORMAT.facts(tmp_path))
     assert load(colmap_options(tmp_path, adjust="auto")).train
 
 
@@ -206,5 +206,5 @@ def test_wrong_words_and_hopeless_models_are_refused(tmp_path: Path, monkeypatch
             return pycolmap.BundleAdjustmentSummary()
 
     monkeypatch.setattr(pycolmap, "create_default_bundle_adjuster", lambda *given: Hopeless())
-    refused(r"came to nothing.*scene\.adjust=never", load, colmap_options(tmp_path, adjust="always"))
+    refused(r"failed.*scene\.adjust=never", load, colmap_options(tmp_path, adjust="always"))
     assert not list((tmp_path / "cache").rglob("*.bin"))

@@ -201,7 +201,7 @@ def test_points_towards_the_horizon_stay_near() -> None:
 
 def test_cameras_that_look_up_need_points() -> None:
     up = look_at([0, 0, 5], [3, 0, 9], fov_x=0.5, width=40, height=30)
-    refused("looks down", city_points, [up], 10, 0.5, torch.Generator())
+    refused("points down", city_points, [up], 10, 0.5, torch.Generator())
 
 
 def test_points_of_the_original_data(tmp_path: Path) -> None:

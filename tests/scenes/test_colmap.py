@@ -602,7 +602,7 @@ def test_a_pose_that_is_no_number_is_refused(field: str) -> None:
     good = Camera(rotation=torch.eye(3), translation=torch.zeros(3), fx=1.0, fy=1.0, cx=1.0, cy=1.0, width=2, height=2)
     Shot(name="a", photo=Path("a.png"), whole=good, expected_size=(2, 2))
     bad = replace(good, **{field: getattr(good, field) * math.nan})
-    with pytest.raises(InputError, match=r"camera of 'a\.png' is .* turned by no number"):
+    with pytest.raises(InputError, match=r"camera of 'a\.png' is .* rotation that is not finite"):
         Shot(name="a", photo=Path("a.png"), whole=bad, expected_size=(2, 2))
 
 

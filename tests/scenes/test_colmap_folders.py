@@ -173,7 +173,7 @@ def test_a_ply_stands_in_for_points(tmp_path: Path) -> None:
     scene = load(colmap_options(tmp_path))
     np.testing.assert_array_equal(scene.points.positions.numpy(), points)
     assert any("Points are those of points3D.ply" in note for note in scene.notes)
-    assert any("no observations to check the cameras by; 100%" in note for note in scene.notes)
+    assert any("no observations to check the cameras; 100%" in note for note in scene.notes)
     with pytest.raises(InputError, match=r"keeps no observations to adjust cameras by: set scene\.adjust=never"):
         load(colmap_options(tmp_path, adjust="always"))
 
@@ -193,8 +193,8 @@ def test_poses_that_are_not_used_are_named(tmp_path: Path, caplog: pytest.LogCap
     write_scene(RECONSTRUCTION, tmp_path)
     (tmp_path / "images" / "poses_bounds.npy").touch()
     assert scene_words(tmp_path / "images", [], plugins())[0] == "scene=photos"
-    assert "poses of LLFF, which gsx does not read" in caplog.text
-    assert f"{tmp_path} has poses of photos, which are not used here: gsx {tmp_path} does" in caplog.text
+    assert "cameras of LLFF, which gsx does not read" in caplog.text
+    assert f"{tmp_path} has poses of photos, which are not used here: gsx {tmp_path} uses them" in caplog.text
 
 
 def test_a_database_is_no_model(tmp_path: Path) -> None:

@@ -180,7 +180,7 @@ def test_points_that_were_removed_from_their_file_alone_are_left_out(tmp_path: P
     assert scene.notes[-1].startswith("Reprojection error 0.00 px (median of 200 observations")
     adjusted = load(colmap_options(tmp_path, adjust="always")).notes
     assert adjusted[0] == scene.notes[0]
-    assert "then pictures lie 0.00 px" in adjusted[1]
+    assert "then pictures are 0.00 px" in adjusted[1]
 
 
 def test_gsx_scenes_says_it(tmp_path: Path) -> None:

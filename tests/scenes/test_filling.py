@@ -9,7 +9,7 @@ from torch import Tensor
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.scenes import filling
-from gsx.scenes.filling import filled, gaps_of, in_front, in_view
+from gsx.scenes.filling import fill_gaps, gaps_of, in_front, in_view
 
 EYES = [(x, -6.0, z) for x in (-1.0, 0.0, 1.0) for z in (-0.5, 0.5)]
 
@@ -53,7 +53,7 @@ def scene_of(positions: Tensor, source: Columns | None = None) -> Scene:
 
 
 def added(scene: Scene, count: int, seed: int = 0) -> tuple[Tensor, Tensor, Scene]:
-    more = filled(scene, count, torch.Generator().manual_seed(seed))
+    more = fill_gaps(scene, count, torch.Generator().manual_seed(seed))
     old = len(scene.points)
     assert torch.equal(more.points.positions[:old], scene.points.positions)
     return more.points.positions[old:], more.points.colours[old:], more
@@ -103,7 +103,7 @@ def test_nothing_is_added_where_masked_or_where_nothing_is_known() -> None:
     assert len(where) > 0
     assert what[:, 0].min() >= 60
     few = scene_of(wall(10))
-    assert filled(few, 300, torch.Generator().manual_seed(0)) is few
+    assert fill_gaps(few, 300, torch.Generator().manual_seed(0)) is few
     assert gaps_of(few.train[0], few.points, 5, torch.Generator().manual_seed(0)) is None
 
 

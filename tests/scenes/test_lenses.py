@@ -55,7 +55,7 @@ def test_a_keypoint_without_a_ray_is_left_out(tmp_path: Path) -> None:
         "keypoints for which the lens has no ray, left out: 1."
     )
     assert shift_of(read_model(folder)) == pytest.approx(0, abs=1e-6)
-    assert any("fit       pictures lie 0.00 px" in line and "left out: 1" in line for line in FORMAT.facts(tmp_path))
+    assert any("fit       pictures are 0.00 px" in line and "left out: 1" in line for line in FORMAT.facts(tmp_path))
 
 
 def test_a_keypoint_without_a_ray_hides_no_wrong_focal_length(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_where_no_keypoint_has_a_ray_points_in_view_are_counted(tmp_path: Path) 
     note = load(colmap_options(tmp_path)).notes[-1]
     assert note.startswith("No keypoint can check the cameras; 100% of its points are in view; keypoints for which")
     assert fit_line(read_model(folder)).startswith(
-        "too few observations tell; keypoints for which the lens has no ray, left out: 250"
+        "too few observations; keypoints for which the lens has no ray, left out: 250"
     )
 
 

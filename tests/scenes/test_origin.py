@@ -22,7 +22,7 @@ from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.formats.origin import NO_ORIGIN, chosen_origin, comment_of, origin_of_positions, stated_in
 from gsx.formats.ply import write_ply
-from gsx.scenes.origin import around_origin, origin_of, point_looked_at
+from gsx.scenes.origin import around_origin, focus_of, origin_of
 
 UTM = (500_000.0, 5_400_000.0, 300.0)
 ECEF = (4_075_580.5, 931_853.25, 4_801_568.125)
@@ -195,7 +195,7 @@ def test_the_point_that_cameras_look_at() -> None:
     goal = [5e5 + 0.25, 5.4e6, 300.0]
     eyes = [[goal[0] + x, goal[1] + y, goal[2] + 1] for x, y in ((3, 0), (0, 4), (-3, 1))]
     cameras = [look_at(eye, goal, fov_x=0.9, width=24, height=16) for eye in eyes]
-    torch.testing.assert_close(point_looked_at(cameras), torch.tensor(goal, dtype=torch.float64), atol=1e-6, rtol=0)
+    torch.testing.assert_close(focus_of(cameras), torch.tensor(goal, dtype=torch.float64), atol=1e-6, rtol=0)
 
 
 def rounded_poses(file: Path) -> None:
@@ -215,5 +215,5 @@ def test_adjustment_finds_cameras_whose_turns_text_has_rounded(tmp_path: Path) -
     for name in ("frames.txt", "rigs.txt"):
         (model / name).unlink(missing_ok=True)
     rounded_poses(model / "images.txt")
-    refused(r"scene\.adjust=auto finds them anew", loaded, tmp_path, words)
+    refused(r"scene\.adjust=auto estimates them anew", loaded, tmp_path, words)
     torch.testing.assert_close(positions(loaded(tmp_path, words, "scene.adjust=auto"))[0], exact, atol=0.01, rtol=0)

@@ -136,7 +136,7 @@ def test_photos_held_and_stored_in_any_way_give_one_camera_and_upright_views(
     for file in model.glob("*.bin"):
         assert file.read_bytes().replace(b".webp\0", b".png\0") == (first / file.name).read_bytes(), file.name
     assert "EXIF turns 3 of 5 photos upright (scene.orientation)." in scene.notes
-    assert "1 photos that a tool has turned share the camera of those of their lens that are not." in scene.notes
+    assert "1 photos that a tool has turned share the camera of the others of their lens." in scene.notes
     assert scene.provenance["turned"] == 4
     before = {view.name: view for view in (*expected.train, *expected.test)}
     for view in (*scene.train, *scene.test):
@@ -187,18 +187,18 @@ def test_hidden_files_are_no_photos(tmp_path: Path) -> None:
     assert find_photos(tmp_path / "deep")[1] == ["cam/a.jpg", "cam/b.jpg"]
 
 
-def test_photos_that_are_passed_over_are_told(tmp_path: Path) -> None:
+def test_unused_photos_are_reported(tmp_path: Path) -> None:
     for place in ("", "images", "masks"):
         (tmp_path / place).mkdir(exist_ok=True)
         for name in ("a.jpg", "b.jpg"):
             (tmp_path / place / name).touch()
-    (note,) = photos.passed_over(tmp_path, find_photos(tmp_path)[0])
+    (note,) = photos.unused_folder(tmp_path, find_photos(tmp_path)[0])
     assert note == (
-        f"2 photos in images are not used, as there are some in {tmp_path}: set scene.path to the folder that is meant."
+        f"2 photos in images are not used, as there are some in {tmp_path}: set scene.path to the folder to use."
     )
     (tmp_path / "a.jpg").unlink()
     (tmp_path / "b.jpg").unlink()
-    assert photos.passed_over(tmp_path, find_photos(tmp_path)[0]) == []
+    assert photos.unused_folder(tmp_path, find_photos(tmp_path)[0]) == []
 
 
 def test_photos_share_a_camera_by_size_and_by_lens(tmp_path: Path) -> None:
@@ -421,7 +421,11 @@ def test_progress_is_logged_with_stage_count_and_time(
     monkeypatch.setattr(sfm, "LOG_SECONDS", 0.01)
     with caplog.at_level(logging.INFO):
         logged = threading.Event()  # the stage ends once its progress has been logged
-        assert sfm.watched("matches of pairs", lambda token: logged.wait(60) and 42, lambda: logged.set() or 7, 9) == 42
+
+        def work(cancellation_token: Any) -> int:
+            return logged.wait(60) and 42
+
+        assert sfm.run_stage("matches of pairs", work, lambda: logged.set() or 7, 9) == 42
     assert any(line.startswith("sfm: matches of pairs 7/9, ") for line in caplog.messages)
     assert caplog.messages[-1].startswith("sfm: matches of pairs done")
 
@@ -430,23 +434,23 @@ def test_interruption_cancels_the_stage(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(sfm, "LOG_SECONDS", 0.01)
     cancelled: list[bool] = []
 
-    def work(token: Any) -> None:
+    def work(cancellation_token: Any) -> None:
         until = time.monotonic() + 10
-        while not token.is_cancelled and time.monotonic() < until:
+        while not cancellation_token.is_cancelled and time.monotonic() < until:
             time.sleep(0.01)
-        cancelled.append(token.is_cancelled)
+        cancelled.append(cancellation_token.is_cancelled)
 
     def interrupt() -> int:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sfm.watched("features", work, interrupt, 1)
+        sfm.run_stage("features", work, interrupt, 1)
     assert cancelled == [True]
 
 
 def test_error_of_a_stage_comes_through() -> None:
-    def fail(token: Any) -> None:
+    def fail(cancellation_token: Any) -> None:
         raise ValueError("no such thing")
 
     with pytest.raises(ValueError, match="no such thing"):
-        sfm.watched("features", fail, lambda: 0, 1)
+        sfm.run_stage("features", fail, lambda: 0, 1)

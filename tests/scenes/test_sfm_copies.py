@@ -110,15 +110,15 @@ def every_format(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def prepared(folder: Path, work: Path, first: dict[str, int] | None = None) -> tuple[Path, list[str]]:
+def folder_for_colmap(folder: Path, work: Path, first: dict[str, int] | None = None) -> tuple[Path, list[str]]:
     """The folder that COLMAP gets, and all names."""
     sizes, _ = readable_sizes(folder, find_photos(folder)[1])
     doubtful = sfm_copies.candidates(folder, dict.fromkeys(sizes, 1) | (first or {}))
-    return sfm_copies.prepared(folder, list(sizes), doubtful, work), list(sizes)
+    return sfm_copies.folder_for_colmap(folder, list(sizes), doubtful, work), list(sizes)
 
 
 def test_every_promised_format_comes_to_colmap_as_gsx_sees_it(every_format: Path, tmp_path: Path) -> None:
-    folder, names = prepared(every_format, tmp_path)
+    folder, names = folder_for_colmap(every_format, tmp_path)
     assert sorted(names) == sorted([*ALIKE, *CONVERTED])
     assert {Path(name).suffix.lower() for name in names} == {*PHOTO_SUFFIXES}
     assert sorted(name for name in names if not (folder / name).is_symlink()) == sorted(CONVERTED)
@@ -134,7 +134,7 @@ def test_every_promised_format_comes_to_colmap_as_gsx_sees_it(every_format: Path
 def test_photos_that_both_read_are_used_in_place(every_format: Path, tmp_path: Path) -> None:
     for name in ("rgb.png", "plain.tif"):  # nothing is decoded twice, nothing written
         (tmp_path / name).write_bytes((every_format / name).read_bytes())
-    assert prepared(tmp_path, tmp_path / "work")[0] == tmp_path
+    assert folder_for_colmap(tmp_path, tmp_path / "work")[0] == tmp_path
     assert not (tmp_path / "work").exists()
 
 
@@ -142,7 +142,7 @@ def test_copies_keep_what_the_lens_is_known_by(tmp_path: Path) -> None:
     """COLMAP begins at the focal length that a WebP photo states as at that of a JPEG photo."""
     write_webp_with_exif(tmp_path / "a.webp", PICTURE, LENS | {"Orientation": 6})
     by_openimageio(PICTURE, Orientation=6)(tmp_path / "b.jpg")
-    folder, _ = prepared(tmp_path, tmp_path / "work")
+    folder, _ = folder_for_colmap(tmp_path, tmp_path / "work")
     assert lens_of(tmp_path / "a.webp") == lens_of(folder / "a.webp") == lens_of(tmp_path / "b.jpg")
     assert lens_of(tmp_path / "a.webp")[3] == 28.0
     cameras = [pycolmap.infer_camera_from_image(folder / name) for name in ("a.webp", "b.jpg")]
@@ -153,7 +153,7 @@ def test_copies_keep_what_the_lens_is_known_by(tmp_path: Path) -> None:
 def test_mirrored_photos_come_to_colmap_without_the_mirror(tmp_path: Path) -> None:
     by_openimageio(PICTURE, Orientation=5)(tmp_path / "a.png")
     by_openimageio(PICTURE, Orientation=6)(tmp_path / "b.png")
-    folder, _ = prepared(tmp_path, tmp_path / "work", {"a.png": 2})
+    folder, _ = folder_for_colmap(tmp_path, tmp_path / "work", {"a.png": 2})
     assert (folder / "b.png").is_symlink()
     copied = torch.from_numpy(pycolmap.Bitmap.read(folder / "a.png", True).to_array()).permute(2, 0, 1)
     assert torch.equal(copied, torch.from_numpy(PICTURE).permute(2, 0, 1).flip(-1))
@@ -164,7 +164,7 @@ def test_mirrored_photos_come_to_colmap_without_the_mirror(tmp_path: Path) -> No
 def test_copies_take_no_other_photos_place(tmp_path: Path) -> None:
     for name in ("a.webp", "a.webp.png", "a.png"):
         by_openimageio(PICTURE)(tmp_path / name)
-    folder, names = prepared(tmp_path, tmp_path / "work")
+    folder, names = folder_for_colmap(tmp_path, tmp_path / "work")
     assert sorted(file.name for file in folder.iterdir()) == sorted(names) == ["a.png", "a.webp", "a.webp.png"]
     assert [name for name in names if not (folder / name).is_symlink()] == ["a.webp"]
 

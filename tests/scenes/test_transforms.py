@@ -366,7 +366,7 @@ def test_a_photo_under_another_name_is_named(tmp_path: Path, named: str, there: 
     remedy = f"'{there}' is there, correct '{plain_name(named)}' in the file" if there else "complete them"
     with pytest.raises(InputError) as caught:
         load(options(tmp_path))
-    assert f"{remedy}, or train on what is there with scene.missing=0.34" in str(caught.value)
+    assert f"{remedy}, or train on the others with scene.missing=0.34" in str(caught.value)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-32"])
@@ -382,7 +382,7 @@ def test_what_is_left_out_of_instant_ngp_is_said(tmp_path: Path) -> None:
     write(
         tmp_path, rolling_shutter=[0, 0.5, 0, 0], white_transparent=False, aabb_scale=4, sharpness=3.0, offset=[1, 2, 3]
     )
-    told = "transforms.json states rolling_shutter: left out, photos are taken as they are."
+    told = "transforms.json states rolling_shutter: left out, photos are used as stored."
     assert told in load(options(tmp_path)).notes
     write(tmp_path, rolling_shutter=[0, 0, 0, 0], depth_file_path="a.png", orientation_override="none")
     assert not any("left out" in note for note in load(options(tmp_path)).notes)

@@ -118,7 +118,9 @@ def test_mirrored_photos_of_a_model_stay_mirrored_and_a_note_says_so(tmp_path: P
         assert view.camera.draws_as(oriented_camera(before.camera, turn))
         assert torch.equal(view.image(), oriented(before.image(), turn))
     (note,) = (note for note in load(colmap_options(held)).notes if note.startswith("EXIF mirrors"))
-    assert note.startswith("EXIF mirrors 4 photos, but the cameras are stated for them as stored: they stay mirrored (")
+    assert note.startswith(
+        "EXIF mirrors 4 photos, but their cameras are those of the stored photos: they stay mirrored ("
+    )
 
 
 def test_photos_turned_since_are_refused_with_the_remedy(tmp_path: Path) -> None:

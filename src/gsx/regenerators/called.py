@@ -13,23 +13,24 @@ from torch import Tensor
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
 from gsx.core.shapes import Float
-from gsx.core.training.regenerator import RegeneratorContext, Request
+from gsx.core.training.regenerator import Request
+from gsx.regenerators.classical import Fixed
 
 
 @contextmanager
-def beside_the_user() -> Iterator[None]:
-    """Modules of the working directory can be imported, those that are installed come first."""
-    here = os.getcwd()
-    sys.path.append(here)
+def working_directory_importable() -> Iterator[None]:
+    """Let modules of the working directory be imported; installed ones come first."""
+    folder = os.getcwd()
+    sys.path.append(folder)
     try:
         yield
     finally:
-        del sys.path[len(sys.path) - 1 - sys.path[::-1].index(here)]
+        del sys.path[len(sys.path) - 1 - sys.path[::-1].index(folder)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalledOptions:
-    """Options; values in conf/regenerator/*/callable.yaml."""
+    """Options of conf/regenerator/*/callable.yaml."""
 
     name: str
     function: str
@@ -38,31 +39,26 @@ class CalledOptions:
     arguments: dict[str, Any]
 
     def named_code(self) -> str:
-        """The function."""
+        """Return the name of the function."""
         return self.function
 
 
-class Called:
-    """Calls a function for each picture."""
+class Called(Fixed):
+    """A call of one function for each picture."""
 
-    def __init__(self, options: CalledOptions) -> None:
-        self.options = options
+    options: CalledOptions
 
     def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
-        """The function can be found."""
+        """Raise ConfigError if the function cannot be imported."""
         self.function()
 
-    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
-        """Nothing to learn."""
-        return {}
-
     def function(self) -> Callable[..., Tensor]:
-        """The function."""
+        """Import the function."""
         module, colon, name = self.options.function.partition(":")
         try:
-            with beside_the_user():
+            with working_directory_importable():
                 found = getattr(import_module(module), name) if colon else None
-        except Exception as error:  # whatever a user's module raises
+        except Exception as error:  # a user's module may raise anything
             raise ConfigError(
                 f"regenerator callable: function={self.options.function} cannot be imported ({error})"
             ) from error
@@ -73,11 +69,9 @@ class Called:
         return found
 
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
-        """Each picture, in order."""
-        function = self.function()
+        """Return the function's results, in order."""
+        function, more = self.function(), self.options.arguments
         return [
-            function(
-                r.image, scale=r.scale, prompt=r.prompt, seed=r.seed, strength=r.strength, **self.options.arguments
-            )
+            function(r.image, scale=r.scale, prompt=r.prompt, seed=r.seed, strength=r.strength, **more)
             for r in requests
         ]

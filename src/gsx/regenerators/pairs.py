@@ -1,4 +1,4 @@
-"""Renders and the photographs they should have been: what restorers learn from, and are measured on."""
+"""Pairs of render and photograph that restorers learn from and are measured on."""
 
 from collections.abc import Iterable, Sequence
 
@@ -6,34 +6,37 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.masks import where_counted
+from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.training.regenerator import RegeneratorContext
 
 Pair = tuple[Tensor, Tensor]
 """(render, photograph), [3, h, w] each, display values."""
 OWN_EVERY = 6
-"""Of so many pairs to learn from one more shows the run's own render, which is to be left alone more (usual: 10 to
-20 %)."""
+"""One own render of the run is added per so many pairs: restorers shall hardly change it (usual: 10 to 20 %)."""
 
 
 def held_out_pairs(context: RegeneratorContext, share: float) -> list[Pair]:
-    """Every training view as a model shows it that was not fitted to it (`RegeneratorContext.held_out`); what of a
-    photograph does not count shows the render, so that nothing is learnt there."""
-    renders = context.held_out(share)
-    shown = zip(renders, context.views, strict=True)
-    return [(render, where_counted(view.image(), render.cpu(), view.counted())) for render, view in shown]
+    """Pair each training view with the render of a model that was not fitted to it (`RegeneratorContext.held_out`)."""
+    return [pair_of(render, view) for render, view in zip(context.held_out(share), context.views, strict=True)]
 
 
 def with_own(pairs: Sequence[Pair], context: RegeneratorContext, numbers: Sequence[int]) -> list[Pair]:
-    """The pairs of training views of these numbers, and beside some of them the run's own renders."""
+    """Return the pairs of these training views, and for every `OWN_EVERY`-th of them one with the run's own render."""
     views = [context.views[number] for number in numbers[::OWN_EVERY]]
-    own = [(context.render(view.camera).cpu(), view) for view in views]
-    learnt = [(render, where_counted(view.image(), render, view.counted())) for render, view in own]
-    return [*(pairs[number] for number in numbers), *learnt]
+    return [
+        *(pairs[number] for number in numbers),
+        *(pair_of(context.render(view.camera).cpu(), view) for view in views),
+    ]
+
+
+def pair_of(render: Tensor, view: View) -> Pair:
+    """Pair a render with its photo; masked pixels of the photo hold the render, so that nothing is learnt there."""
+    return render, where_counted(view.image(), render.cpu(), view.counted())
 
 
 def random_part(pairs: Sequence[Pair], size: tuple[int, int], generator: torch.Generator) -> Pair:
-    """The same part, of that (height, width), of a render and its photograph, mirrored at random."""
+    """Cut one random window of that (height, width) out of a render and its photo, mirrored at random."""
     pair = pairs[int(torch.randint(len(pairs), (), generator=generator))]
     top, left = (
         int(torch.randint(whole - part + 1, (), generator=generator))
@@ -46,6 +49,6 @@ def random_part(pairs: Sequence[Pair], size: tuple[int, int], generator: torch.G
 
 
 def mean_square(pairs: Iterable[Pair]) -> float:
-    """Mean squared difference of pictures and photographs."""
+    """Return the mean squared difference of pictures and photos."""
     errors = [float((image - photo).square().mean()) for image, photo in pairs]
     return sum(errors) / len(errors)

@@ -1,8 +1,8 @@
 """Super-resolution learnt from the scene's own photographs (ours; the idea: ZSSR, Shocher et al. 2018).
 
 Photographs reduced by two as the scene reduces them, and themselves, are pairs of input and truth; textures that recur
-at several distances are what it learns. Every picture it gives back reduces to its input (`reduction.projected`),
-x4 and x8 by recursion.
+at several distances are what it learns. Every result reduces to its input (`reduction.projected`), x4 and x8 by
+recursion.
 """
 
 import hashlib
@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from torch import Tensor, nn
@@ -22,22 +22,21 @@ from gsx.core.data.reduction import Reduction, projected
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
-from gsx.core.files import replace_file
 from gsx.core.ranges import Interval, Range, Rate, Seconds
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import RegeneratorContext, Request
-from gsx.engine.cache import add_to_manifest, cache_folder, content_key, is_intact
+from gsx.engine.cache import add_to_manifest, cache_folder, content_key, is_intact, source_digest
 from gsx.engine.machine import machine_stamp, multiplies_bfloat16
+from gsx.regenerators.networks import fit, initialise, read_tensors, write_tensors
 
 logger = logging.getLogger(__name__)
 
-STEP = 2
-"""Factor of one application."""
+STEP = 2  # factor of one application
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSROptions:
-    """Options; values in conf/regenerator/upscale/scene_sr.yaml."""
+    """Options of conf/regenerator/upscale/scene_sr.yaml."""
 
     name: str
     channels: Annotated[int, Range(1, 1024)]
@@ -58,7 +57,7 @@ class SceneSROptions:
 
 
 class Enlarger(nn.Module):
-    """Bicubic enlargement and what convolutions on the low resolution add to it."""
+    """Bicubic enlargement plus detail from convolutions on the low resolution."""
 
     def __init__(self, channels: int, layers: int, generator: torch.Generator) -> None:
         super().__init__()
@@ -66,82 +65,75 @@ class Enlarger(nn.Module):
         self.middle = nn.ModuleList(nn.Conv2d(channels, channels, 3, padding=1) for _ in range(layers))
         self.last = nn.Conv2d(channels, 3 * STEP * STEP, 3, padding=1)
         for layer in (self.first, *self.middle):
-            begin(layer, generator)
+            initialise(layer, generator)
         nn.init.zeros_(self.last.weight)  # training starts from the plain enlargement
         nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
 
     def forward(self, image: Float[Tensor, "B 3 h w"], bfloat16: bool = False) -> Float[Tensor, "B 3 H W"]:
-        """Twice as wide and high; bfloat16: by convolutions of such numbers."""
+        """Double width and height; `bfloat16`: the type of the convolutions."""
         with torch.autocast(image.device.type, torch.bfloat16, enabled=bfloat16):
             detail = self.detail(image).float()
         return interpolate(image, scale_factor=STEP, mode="bicubic", align_corners=False) + detail
 
     def detail(self, image: Float[Tensor, "B 3 h w"]) -> Float[Tensor, "B 3 H W"]:
-        """What is added to the plain enlargement. Pixels lie beside each other whose channels do: a fifth faster."""
+        """Return what is added to the bicubic enlargement; channels-last memory makes it a fifth faster."""
         features = torch.relu(self.first((image - 0.5).contiguous(memory_format=torch.channels_last)))
         for layer in self.middle:
             features = features + torch.relu(layer(features))
         return nn.functional.pixel_shuffle(self.last(features), STEP)
 
 
-def begin(layer: nn.Module, generator: torch.Generator) -> None:
-    """Initial weights from the generator (He et al. 2015)."""
-    assert isinstance(layer, nn.Conv2d)
-    assert layer.bias is not None
-    nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
-    nn.init.zeros_(layer.bias)
-
-
 class SceneSR:
-    """Learns once per scene, before its first pictures."""
+    """A super-resolution network that learns once per scene, before its first pictures."""
 
     def __init__(self, options: SceneSROptions) -> None:
         self.options = options
         self.network: Enlarger | None = None
 
     def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
-        """It doubles, any number of times."""
+        """Raise ConfigError for a scale that is no power of two."""
         odd = [scale for scale in scales if scale & (scale - 1)]
         if odd:
             raise ConfigError(f"regenerator scene_sr enlarges x2, x4, x8, not x{odd[0]}: change the augmenter's scales")
 
     def prepare(self, context: RegeneratorContext) -> dict[str, float]:
-        """Train, or take what an earlier run of the same scene and options has learnt."""
+        """Train, or read the network of an earlier run with the same photos and options."""
         if self.network is not None:
             return {}
         photos = [view.image() for view in context.views]
         generator = torch.Generator().manual_seed(context.seed)
         self.network = Enlarger(self.options.channels, self.options.layers, generator).to(context.device)
         path = kept_at(self.options, photos, context.reduction, context.seed, context.device)
-        if is_intact(path) and (found := read_network(path)) is not None:
+        if is_intact(path) and (found := read_tensors(path)) is not None:
             self.network.load_state_dict(found)
             return {"learnt_before": 1.0}
-        begun = time.perf_counter()
+        start = time.perf_counter()
         loss, complete = train(self.network, photos, context, self.options)
-        seconds = time.perf_counter() - begun
+        seconds = time.perf_counter() - start
         logger.info("scene_sr learnt from %d photographs in %.0f s", len(photos), seconds)
         if complete:
-            write_network(path, self.network)
+            try:
+                write_tensors(path, self.network.state_dict())
+                add_to_manifest(path)
+            except OSError as error:
+                logger.warning("%s cannot be written (%s): the next run learns again", path, error.strerror)
         return {"seconds": seconds, "loss": loss}
 
     @torch.no_grad()
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
-        """Each picture, `scale` times as large, by doubling."""
+        """Return each picture `scale` times as large."""
         assert self.network is not None
         return [enlarged(self.network, request) for request in requests]
 
 
 def enlarged(network: Enlarger, request: Request) -> Float[Tensor, "3 H W"]:
-    """One picture, doubled until it is large enough; it reduces to what it was made from."""
-    image = given = request.image.to(next(network.parameters()).device)
+    """Double a picture until it is large enough; the result reduces to its input."""
+    image = source = request.image.to(next(network.parameters()).device)
     for _ in range(round(math.log2(request.scale))):
         image = projected(network(image[None])[0], image, STEP, request.reduction)
     if request.scale > STEP and request.reduction.filter != "area":  # two reductions are not one by twice the factor
-        image = projected(image, given, request.scale, request.reduction)
+        image = projected(image, source, request.scale, request.reduction)
     return image
-
-
-# -- learning ----------------------------------------------------------------------------------------------------------
 
 
 def train(
@@ -150,40 +142,32 @@ def train(
     context: RegeneratorContext,
     options: SceneSROptions,
 ) -> tuple[float, bool]:
-    """(mean loss of the last tenth, whether all steps were taken). Convolutions are of bfloat16 where a device has
-    units for that, and learn as much; pictures are drawn in float32."""
+    """Train; returns (mean loss of the last tenth, whether all steps were taken).
+
+    Convolutions use bfloat16 where the device multiplies it, and learn as much; results are computed in float32.
+    """
     generator, reduction = torch.Generator().manual_seed(context.seed), context.reduction
     device = next(network.parameters()).device
     bfloat16 = multiplies_bfloat16(device)
-    optimiser = torch.optim.Adam(network.parameters(), lr=options.rate)
-    decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, options.steps, eta_min=options.rate / 100)
-    losses: list[float] = []
-    begun = time.perf_counter()
-    for _ in range(options.steps):
-        context.raise_if_stopping()
-        if options.seconds and time.perf_counter() - begun > options.seconds:
-            logger.warning(
-                "scene_sr stops after %d of %d steps: regenerator.upscale.seconds", len(losses), options.steps
-            )
-            break
+
+    def loss_of() -> Tensor:
         low, truth = (part.to(device) for part in pairs(photos, reduction, options, generator))
         noise = torch.randn(low.shape, generator=generator).to(device) * options.noise / 255
         out = network(low + noise, bfloat16)
         off = reduction.inner(reduction.reduce(out, STEP) - low)
-        loss = (out - truth).abs().mean() + off.abs().mean()
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        optimiser.step()
-        decay.step()
-        losses.append(float(loss.detach()))
-    tail = losses[-max(1, len(losses) // 10) :]
+        return (out - truth).abs().mean() + off.abs().mean()
+
+    losses = fit(network, loss_of, context, options.steps, options.rate, options.seconds)
+    if len(losses) < options.steps:
+        logger.warning("scene_sr stops after %d of %d steps: regenerator.upscale.seconds", len(losses), options.steps)
+    tail = [float(loss) for loss in losses[-max(1, len(losses) // 10) :]]
     return sum(tail) / max(1, len(tail)), len(losses) == options.steps
 
 
 def pairs(
     photos: Sequence[Float[Tensor, "3 H W"]], reduction: Reduction, options: SceneSROptions, generator: torch.Generator
 ) -> tuple[Float[Tensor, "B 3 h w"], Float[Tensor, "B 3 H W"]]:
-    """(reduced crops of photographs, the crops): larger ones are reduced, then both lose their borders."""
+    """Return (reduced crops of photographs, the crops); both lose the borders that the reduction's filter reaches."""
     edge = options.crop + 2 * reduction.rim
     larger = torch.stack([crop(photos, edge, generator) for _ in range(options.batch)])
     low = reduction.inner(reduction.reduce(larger, STEP))
@@ -193,7 +177,7 @@ def pairs(
 
 
 def crop(photos: Sequence[Float[Tensor, "3 H W"]], edge: int, generator: torch.Generator) -> Float[Tensor, "3 h w"]:
-    """A part of a photograph, turned and mirrored at random; twice `edge` wide, or as much as there is."""
+    """Cut a random part out of a photograph, turned and mirrored; its side is 2 `edge` or the shortest photo's."""
     photo = photos[int(torch.randint(len(photos), (), generator=generator))]
     size = STEP * min(edge, *(min(p.shape[1:]) // STEP for p in photos))
     top, left = (int(torch.randint(whole - size + 1, (), generator=generator)) for whole in photo.shape[1:])
@@ -203,42 +187,15 @@ def crop(photos: Sequence[Float[Tensor, "3 H W"]], edge: int, generator: torch.G
     return part.flip(2) if turns >= 4 else part
 
 
-# -- files -------------------------------------------------------------------------------------------------------------
-
-
 def kept_at(
     options: SceneSROptions, photos: Sequence[Tensor], reduction: Reduction, seed: int, device: torch.device
 ) -> Path:
-    """Where what is learnt from these photographs, reduced so, with these options and seed, by this code and machine,
-    is kept."""
-    digest = hashlib.sha256(Path(__file__).read_bytes())
+    """Return the network's place in the cache, by everything that decides its weights: inputs, code and machine."""
+    digest = hashlib.sha256()
     for photo in photos:
         digest.update(repr(tuple(photo.shape)).encode())
         digest.update((photo * 255).round().to(torch.uint8).numpy().tobytes())
     machine = [*machine_stamp(device), multiplies_bfloat16(device)]
-    key = content_key(asdict(options), asdict(reduction), digest.hexdigest(), seed, machine)
+    code = source_digest(Path(__file__), Path(__file__).with_name("networks.py"))
+    key = content_key(asdict(options), asdict(reduction), code, digest.hexdigest(), seed, machine)
     return cache_folder("scene_sr", key) / "network.safetensors"
-
-
-def write_network(path: Path, network: nn.Module) -> None:
-    """Keeps a network; a cache that cannot be written is no error."""
-    from safetensors.torch import save
-
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, save({name: value.contiguous() for name, value in network.state_dict().items()}))
-        add_to_manifest(path)
-    except OSError as error:
-        logger.warning("%s cannot be written (%s): the next run learns again", path, error.strerror)
-
-
-def read_network(path: Path) -> dict[str, Any] | None:
-    """A network as `write_network` left it; None if the file is damaged."""
-    from safetensors import SafetensorError
-    from safetensors.torch import load
-
-    try:
-        return load(path.read_bytes())
-    except (OSError, SafetensorError) as error:
-        logger.warning("%s cannot be read (%s): it is learnt again", path, error)
-        return None

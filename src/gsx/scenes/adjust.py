@@ -1,12 +1,10 @@
 """Bundle adjustment of a COLMAP model by its own observations, where these contradict it.
 
-The cameras of a model that another program wrote, or that was put together by hand, may miss what they observed by the
-same movement everywhere in a picture: a wrong pose, focal length or lens. What each keypoint is off by on its own
-differs: a movement fitted to every other keypoint of an image has to explain those in between. COLMAP's bundle
+A wrong pose, focal length or lens shifts the keypoints of a picture together; noise shifts each on its own. To separate
+them, a movement is fitted to every other keypoint of an image and has to predict those in between. COLMAP's bundle
 adjustment then moves cameras and points to where they explain the observations best.
 
-A model that learns from the photographs cannot do this: it takes a wrong lens in, by points at wrong depths, and no
-photograph contradicts it.
+Training on the photographs cannot do this: it absorbs a wrong lens by points at wrong depths.
 """
 
 import copy
@@ -24,9 +22,9 @@ from gsx.core.errors import InputError
 from gsx.core.shapes import Float
 from gsx.engine.cache import cache_folder, content_key, file_stamp
 from gsx.formats.origin import Origin, chosen_origin
+from gsx.scenes.cached_models import cached_model
 from gsx.scenes.colmap_folders import model_files
 from gsx.scenes.colmap_model import Model, ModelImage, read_model, reconstruction_of
-from gsx.scenes.kept_models import kept_model
 from gsx.scenes.observations import known, straight_keypoints, unmeasured
 from gsx.scenes.sfm import quiet
 from gsx.scenes.undistort import pinhole_of
@@ -34,32 +32,25 @@ from gsx.scenes.undistort import pinhole_of
 logger = logging.getLogger(__name__)
 
 WHEN = ("never", "auto", "always")
-METHOD = "adjusted/2"
-"""Part of the cache key: raise the number when the adjustment changes."""
-LEAST = 32
-"""Observations of an image from which its movement is estimated."""
-SHIFT = 0.25
-"""Px of the model's cameras, root of the mean square, from which on movements of whole pictures are wrong cameras."""
-FLAT = 1e3
-"""A point farther to the side than so many times its depth lies in the plane of the camera's centre."""
-BENT = {"PINHOLE": "OPENCV", "SIMPLE_PINHOLE": "SIMPLE_RADIAL"}
-"""Cameras with distortion, by the same ones without."""
+METHOD = "adjusted/2"  # part of the cache key: raise the number when the adjustment changes
+LEAST = 32  # observations of an image from which its movement is estimated
+SHIFT = 0.25  # px of the model's cameras, root mean square: larger movements of whole pictures mean wrong cameras
+FLAT = 1e3  # a point farther to the side than so many times its depth lies in the plane of the camera's centre
+BENT = {"PINHOLE": "OPENCV", "SIMPLE_PINHOLE": "SIMPLE_RADIAL"}  # cameras with distortion, by those without
 
 
-def adjusted(model: Model, when: str) -> tuple[Model, list[str]]:
-    """Return the model, adjusted as `scene.adjust` says, and a note on that.
+def adjust_model(model: Model, when: str) -> tuple[Model, list[str]]:
+    """Return the model, adjusted if `scene.adjust` says so, and a note; InputError: it cannot be solved."""
+    import pycolmap
 
-    Raises:
-        InputError: a file of it is missing, or nothing could be solved.
-    """
     if when == "never":
         return model, []
     before = shift_of(model)
     if when == "auto" and not (before is not None and before > SHIFT):
         return model, [f"Nothing is adjusted: {fit_words(before)}{unmeasured(model)} (scene.adjust=auto)."]
     stamps = [file_stamp(file) for file in model_files(model.folder).values()]
-    key = content_key(METHOD, colmap_version(), str(model.folder.resolve()), stamps)
-    after = read_model(kept_model(cache_folder("adjusted", key), lambda work: bundle_adjusted(model.folder)))
+    key = content_key(METHOD, str(pycolmap.__version__), str(model.folder.resolve()), stamps)
+    after = read_model(cached_model(cache_folder("adjusted", key), lambda work: bundle_adjusted(model.folder)))
     return after, [
         *(note for note in model.notes if note not in after.notes),
         f"Bundle adjustment of poses, intrinsics and points (scene.adjust={when}): before it {fit_words(before)}, then "
@@ -68,53 +59,42 @@ def adjusted(model: Model, when: str) -> tuple[Model, list[str]]:
 
 
 def fit_words(shift: float | None) -> str:
-    """Return how cameras fit what they observed, in words."""
-    return "too few observations tell" if shift is None else f"pictures lie {shift:.2f} px beside what cameras observed"
+    """Describe how cameras fit their observations."""
+    return "too few observations" if shift is None else f"pictures are {shift:.2f} px off the cameras' observations"
 
 
 def fit_line(model: Model) -> str:
-    """Return how a model's cameras fit, with what to do about it."""
+    """Describe how a model's cameras fit, with a remedy."""
     try:
         shift, rest = shift_of(model), unmeasured(model)
     except InputError as problem:  # of a lens
         return str(problem)
     wrong = shift is not None and shift > SHIFT
-    return fit_words(shift) + str(rest) + (": scene.adjust=auto finds poses and intrinsics anew" if wrong else "")
-
-
-def colmap_version() -> str:
-    """Return the version of COLMAP."""
-    import pycolmap
-
-    return str(pycolmap.__version__)
+    return fit_words(shift) + str(rest) + (": scene.adjust=auto estimates poses and intrinsics anew" if wrong else "")
 
 
 def lens_words(before: Model, after: Model) -> str:
-    """Return by how much focal lengths have changed, and how many lenses were bent, in words."""
+    """Describe the change of focal lengths, and the number of lenses that got distortion."""
     pairs = [(camera, after.cameras[number]) for number, camera in before.cameras.items()]
     ratios = [new.mean_focal_length() / old.mean_focal_length() for old, new in pairs]
     low, high = min(ratios), max(ratios)
     bent = sum(new.model_name != old.model_name for old, new in pairs)
     words = f"; focal lengths times {low:.4f}" + (f" to {high:.4f}" if high - low > 1e-4 else "")
-    return words + (f", lenses of {bent} cameras were bent" if bent else "")
+    return words + (f", {bent} cameras got distortion" if bent else "")
 
 
-# -- do cameras fit what they observed? --------------------------------------------------------------------------------
+# -- fit of cameras to their observations ------------------------------------------------------------------------------
 
 
 def shift_of(model: Model) -> float | None:
-    """Return how far movements of whole pictures put points beside where they were observed, px of the model's cameras:
-    root of the mean square over images; None where none has enough observations."""
+    """Return the root mean square shift of pictures against their observations, model's px; None: too few."""
     squares = [explained(image, model.cameras[image.camera_id]) for image in model.images]
     finite = [square for square in squares if square is not None and math.isfinite(square)]
     return math.sqrt(max(0.0, sum(finite) / len(finite))) if finite else None
 
 
 def explained(image: ModelImage, intrinsics: Any) -> float | None:
-    """Return the mean square of the movement that half the keypoints of an image predict for the other half, px.
-
-    It is negative where they contradict each other; None: too few.
-    """
+    """Return the mean square movement, px^2, that half an image's keypoints predict for the other; None: too few."""
     pinhole, observed = pinhole_of(intrinsics), straight_keypoints(image, intrinsics)
     points = image.observed @ image.rotation.T + image.translation
     usable = (points[:, 2] > 0) & (points[:, :2].abs() <= FLAT * points[:, 2:]).all(1) & known(observed)
@@ -130,7 +110,7 @@ def explained(image: ModelImage, intrinsics: Any) -> float | None:
 
 
 def movements(x: Float[Tensor, "K"], y: Float[Tensor, "K"], z: Float[Tensor, "K"]) -> Float[Tensor, "K 2 8"]:
-    """Return how directions move by a turn about each axis, a step along each, the focal length, radial distortion."""
+    """Return derivatives of directions by turns about each axis, steps along each, focal length, radial distortion."""
     none, one, squared = torch.zeros_like(x), torch.ones_like(x), x * x + y * y
     across = [-x * y, 1 + x * x, -y, one / z, none, -x / z, x, x * squared]
     down = [-1 - y * y, x * y, x, none, one / z, -y / z, y, y * squared]
@@ -138,7 +118,7 @@ def movements(x: Float[Tensor, "K"], y: Float[Tensor, "K"], z: Float[Tensor, "K"
 
 
 def predicted(columns: Float[Tensor, "K 2 8"], off: Float[Tensor, "K 2"], fitted: slice, other: slice) -> float:
-    """Return the mean product of what other observations are off by and what the movement fitted to some predicts."""
+    """Fit a movement to some offsets; returns the mean product of the other offsets with its prediction."""
     squares = off.square().sum(1)
     weights = 1 / (1 + squares / squares.median().clamp_min(1e-18))
     weighted = (columns[fitted] * weights[fitted, None, None]).flatten(0, 1).T
@@ -154,30 +134,31 @@ def predicted(columns: Float[Tensor, "K 2 8"], off: Float[Tensor, "K 2"], fitted
 
 
 def bundle_adjusted(folder: Path) -> Any:
-    """Return the pycolmap.Reconstruction of a folder with cameras and points moved.
+    """Adjust the pycolmap.Reconstruction of a folder; InputError: nothing could be solved.
 
-    Cameras without distortion get some where that moves what they observed.
-
-    Raises:
-        InputError: nothing could be solved.
+    Cameras without distortion get some if that moves their observations by more than `SHIFT`.
     """
     model, *_ = reconstruction_of(folder)
     if not model.num_points3D():
         raise InputError(f"{folder} keeps no observations to adjust cameras by: set scene.adjust=never.")
-    forget_removed_points(model)
+    for image in model.images.values():  # a bundle adjustment refuses observations of removed points
+        for index in image.get_observation_point2D_idxs():
+            if not model.exists_point3D(image.point2D(index).point3D_id):
+                image.reset_point3D_for_point2D(index)
     logger.info("bundle adjustment of %d images and %d points", model.num_reg_images(), model.num_points3D())
-    x, y, z = origin = model_origin(model)
+    centres = torch.from_numpy(np.array([image.projection_center() for image in registered(model)]))
+    middle = centres.median(0).values  # far from the origin, a small turn of a camera moves all its points
+    x, y, z = origin = chosen_origin(middle, float((centres - middle).norm(dim=1).mean()))
     move(model, (-x, -y, -z))
     if any(origin):
         place_cameras(model)
-    return move(bent_where_needed(model, folder), origin)
-
-
-def model_origin(model: Any) -> Origin:
-    """Return the origin around which a model is adjusted: far from it, turning a camera moves everything it sees."""
-    centres = torch.from_numpy(np.array([image.projection_center() for image in registered(model)]))
-    middle = centres.median(0).values
-    return chosen_origin(middle, float((centres - middle).norm(dim=1).mean()))
+    adjust(model, folder)
+    straight = [number for number, camera in model.cameras.items() if camera.model_name in BENT]
+    if straight:
+        bent = with_distortion(model, straight)
+        adjust(bent, folder)
+        model = bent if bend_of(bent, straight) > SHIFT else model
+    return move(model, origin)
 
 
 def registered(model: Any) -> list[Any]:
@@ -200,10 +181,10 @@ def move(model: Any, by: Origin) -> Any:
 
 
 def place_cameras(model: Any) -> None:
-    """Put each camera where its observations say, as it is turned.
+    """Move each camera to where its observations place it, with its rotation.
 
-    A model far from (0, 0, 0) states its cameras by rotation and translation: a rotation that text has rounded to six
-    digits puts a camera of UTM coordinates metres away.
+    A model far from (0, 0, 0) states its cameras by rotation and translation: a rotation rounded to six digits moves a
+    camera of UTM coordinates by metres.
     """
     for image in registered(model):
         rays = image.camera.cam_from_img(observed_pixels(image))
@@ -218,7 +199,7 @@ def place_cameras(model: Any) -> None:
 
 
 def translation_from(rays: Float[np.ndarray, "K 2"], turned: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "3"] | None:
-    """Return the translation by which turned points lie on their rays best; None: too few rays."""
+    """Return the translation that brings turned points closest to their rays; None: too few rays."""
     if len(rays) < LEAST:
         return None
     rows = np.zeros((len(rays), 2, 3))
@@ -228,36 +209,13 @@ def translation_from(rays: Float[np.ndarray, "K 2"], turned: Float[np.ndarray, "
     return translation
 
 
-def bent_where_needed(model: Any, folder: Path) -> Any:
-    """Adjust a model, or a copy in which cameras without distortion have some where that moves what they observed."""
-    adjust(model, folder)
-    straight = [number for number, camera in model.cameras.items() if camera.model_name in BENT]
-    if not straight:
-        return model
-    bent = with_distortion(model, straight)
-    adjust(bent, folder)
-    return bent if bend_of(bent, straight) > SHIFT else model
-
-
-def forget_removed_points(model: Any) -> None:
-    """Remove observations of points that the model lacks, which a bundle adjustment does not take."""
-    for image in model.images.values():
-        for index in image.get_observation_point2D_idxs():
-            if not model.exists_point3D(image.point2D(index).point3D_id):
-                image.reset_point3D_for_point2D(index)
-
-
 def adjust(model: Any, folder: Path) -> None:
-    """Move cameras, focal lengths, distortion and points; on one thread, so that the bits are the same each time.
-
-    Raises:
-        InputError: nothing could be solved.
-    """
+    """Adjust poses, focal lengths, distortion and points, on one thread for equal bits; InputError: it fails."""
     import pycolmap
 
     options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
     options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY  # some observations are of something else
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY  # some observations are wrong
     options.ceres.solver_options.num_threads = 1
     for number in model.reg_image_ids():
         config.add_image(number)
@@ -271,11 +229,11 @@ def adjust(model: Any, folder: Path) -> None:
             f"COLMAP refuses a bundle adjustment of {folder} ({str(problem).strip()}): {remedy}."
         ) from None
     if not summary.is_solution_usable():
-        raise InputError(f"The bundle adjustment of {folder} came to nothing ({summary.brief_report()}): {remedy}.")
+        raise InputError(f"The bundle adjustment of {folder} failed ({summary.brief_report()}): {remedy}.")
 
 
 def with_distortion(model: Any, straight: Sequence[int]) -> Any:
-    """Return a copy in which cameras of these numbers, which have no distortion, could have some."""
+    """Return a copy in which cameras of these numbers have distortion parameters, which are 0."""
     import pycolmap
 
     out = copy.deepcopy(model)
@@ -289,7 +247,7 @@ def with_distortion(model: Any, straight: Sequence[int]) -> Any:
 
 
 def bend_of(model: Any, cameras: Sequence[int]) -> float:
-    """Return by how many px distortion moves what these cameras observed, root of the mean square."""
+    """Return by how many px distortion moves the observations of these cameras, root mean square."""
     squares = [np.zeros(0)]
     for image in registered(model):
         if image.camera_id in cameras:

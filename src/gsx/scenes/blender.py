@@ -25,7 +25,7 @@ from gsx.scenes.frame_files import TEST_FILES, TRAIN_FILE, is_empty, needs_lens,
 from gsx.scenes.lenses import angle_of, beyond_angle, states_lens
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
-from gsx.scenes.origin import origin_of_cameras, point_looked_at
+from gsx.scenes.origin import focus_of, origin_of_cameras
 from gsx.scenes.photo_names import plain_name
 from gsx.scenes.photo_source import PhotoSource
 from gsx.scenes.points import random_points, stored_points
@@ -38,22 +38,22 @@ POINTS_FILE = "points3d.ply"  # where 3D-GS caches its random cloud, and convers
 
 @dataclass(frozen=True, kw_only=True)
 class BlenderOptions(SceneOptions):
-    """Options of `conf/scene/blender.yaml`; the files themselves hold the split (split=json).
+    """Options of `conf/scene/blender.yaml`; with split=json the files are the split.
 
-    `split` can be `none` as well, which trains on the images of both files, and any rule where there is but one file.
+    `split` can be `none` as well, which trains on the images of both files, and any rule where there is only one file.
     """
 
     points: str
     """auto: points3d.ply if the folder has one, else random | random | a PLY file, relative to `path`."""
     random_points: Points
     points_bound: Length
-    """Random points are uniform in the cube [-points_bound, points_bound]^3, scene units."""
+    """Random points are uniform in [-points_bound, points_bound]^3, scene units."""
     seed: Seed
-    """Of the random points."""
+    """Seed of the random points."""
     scales: Annotated[list[int], Range(1, 64)] = field(default_factory=lambda: [1])
-    """Factors by which training images are reduced, each a set of views; a factor given twice is trained on twice."""
+    """Factors of reduction of training images, each a set of views; a repeated factor is trained on repeatedly."""
     test_scales: Annotated[list[int], Range(1, 64)] = field(default_factory=lambda: [1])
-    """Factors by which test images are reduced."""
+    """Factors of reduction of test images."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -68,8 +68,7 @@ def load(options: BlenderOptions) -> Scene:
     """Load a NeRF-synthetic scene; views keep the order of the files.
 
     Raises:
-        ConfigError: `split` is neither `json` nor `none` where the files hold it, or images are reduced by both
-            `downscale` or `max_width` and `scales`.
+        ConfigError: `split` contradicts the files, or `downscale` or `max_width` reduce images as well as `scales`.
         InputError: a file is missing or damaged, there are fewer than two training images, or a scale divides no image.
     """
     folder = expand_home(options.path)
@@ -80,13 +79,15 @@ def load(options: BlenderOptions) -> Scene:
     sides = _split(views, len(train_shots), options.split, folder)
     check_sides(sides, held_out or train_file)
     points, points_note = _points(options, folder, [view.camera for view in views])
-    notes = [*notes, *test_notes, *_test_note(held_out, options.split), *mask_notes(views, options), points_note]
+    if held_out is not None and not held_out.stem.endswith("test") and options.split == "json":
+        test_notes = [*test_notes, f"Test views are those of {held_out.name}: there is no test file."]
+    notes = [*notes, *test_notes, *mask_notes(views, options), points_note]
     details = {"test_file": held_out.name if held_out else None, "points": options.points}
     return at_scales(scene_of(options, folder, views, sides, points, notes, details), options)
 
 
 def at_scales(scene: Scene, options: BlenderOptions) -> Scene:
-    """Return the scene with each view at each of its scales; for whole images alone, the protocol keeps its hash."""
+    """Return the scene with each view at each scale; for whole images alone, the protocol keeps its hash."""
     scales, test_scales = list(options.scales), list(options.test_scales)
     if scales == test_scales == [1]:
         return scene
@@ -103,12 +104,7 @@ def at_scales(scene: Scene, options: BlenderOptions) -> Scene:
 
 
 def reduced(view: View, factor: int, grouped: bool = False) -> View:
-    """Return the view of an image `factor` times smaller, box-averaged before it is composited (Mip-Splatting).
-
-    Raises:
-        ConfigError: the view is reduced already.
-        InputError: `factor` does not divide the image.
-    """
+    """Reduce an image by box averages before compositing (Mip-Splatting); ConfigError, InputError: it cannot be."""
     name, source = "x1" if factor == 1 else f"x1/{factor}", view.source
     group = name if grouped else ""
     if factor == 1:
@@ -128,9 +124,9 @@ def reduced(view: View, factor: int, grouped: bool = False) -> View:
 
 @dataclass(frozen=True)
 class BoxAverage:
-    """Means of factor x factor pixels of each channel, straight alpha among them, truncated to 8 bits (Mip-Splatting).
+    """Means of factor x factor pixels of each channel, straight alpha included, truncated to 8 bits (Mip-Splatting).
 
-    Three 2 x 2 averages of floats in a row are one over 8 x 8; here it is exact. Equal factors share their pictures.
+    Three 2 x 2 averages of floats in a row equal one over 8 x 8, which is exact here. Equal factors share pictures.
     """
 
     factor: int
@@ -142,25 +138,19 @@ class BoxAverage:
 
 
 def read_shots(file: Path, missing: float) -> tuple[list[Shot], list[str]]:
-    """Return the shots of one transforms file, in its order, and notes on missing photos and unused keys.
-
-    Raises:
-        InputError: the file is missing or damaged, or too few of its photos are there.
-    """
+    """Read the shots of a transforms file in order, and notes; InputError: it, or too many photos, are missing."""
     content, frames = read_frames(file)
     angle = angle_of(content)
     if angle is None:
         known = any(map(states_lens, (content, *frames)))
         remedy = "with fl_x use scene=transforms" if known else "add the horizontal angle of view in radians"
-        raise InputError(
-            f"'{file}' has camera_angle_x {reprlib.repr(content.get('camera_angle_x'))}, which is no angle below pi: "
-            f"{remedy}."
-        )
+        stated = reprlib.repr(content.get("camera_angle_x"))
+        raise InputError(f"'{file}' has camera_angle_x {stated}, which is no angle below pi: {remedy}.")
     present, notes = present_frames(file.parent, frames, file, missing)
-    if stated := sorted({key for frame in ({}, *frames) for key in beyond_angle(content, frame)}):
+    if keys := sorted({key for frame in ({}, *frames) for key in beyond_angle(content, frame)}):
         notes.append(
-            f"{file.name} states {', '.join(stated)}, which the format's published readers leave out, and so does "
-            "scene=blender: it uses camera_angle_x alone, without distortion. scene=transforms reads them."
+            f"{file.name} states {', '.join(keys)}, which the format's published readers and scene=blender leave "
+            "out: they use camera_angle_x alone, without distortion. scene=transforms reads them."
         )
     return [_shot(frame, photo, angle, file) for frame, photo in present], notes
 
@@ -174,12 +164,7 @@ def _shot(frame: dict[str, Any], photo: Path, fov_x: float, file: Path) -> Shot:
 
 
 def _test_file(folder: Path, rule: str) -> Path | None:
-    """Return the file of the images to test on; None: all are in transforms_train.json.
-
-    Raises:
-        ConfigError: the files hold the split, and the rule is another one.
-        InputError: they should, and do not.
-    """
+    """Return the file of the test images, if any; ConfigError, InputError: `rule` contradicts the files."""
     file = test_file(folder)
     if file is None and rule == "json":
         raise InputError(
@@ -201,13 +186,8 @@ def _split(views: Sequence[View], count: int, rule: str, folder: Path) -> tuple[
     return [views[i] for i in train], [views[i] for i in test]
 
 
-def _test_note(file: Path | None, rule: str) -> list[str]:
-    validation = file is not None and not file.stem.endswith("test") and rule == "json"
-    return [f"Test views are those of {file.name}: there is no test file."] if file and validation else []
-
-
 def _points(options: BlenderOptions, folder: Path, cameras: Sequence[Camera]) -> tuple[PointCloud, str]:
-    """Return points and their source; random ones lie about (0, 0, 0), or about what far cameras look at."""
+    """Return points and a note; random ones lie around (0, 0, 0), or around the focus of far cameras."""
     auto = options.points == "auto"
     name = POINTS_FILE if auto else options.points
     if name != "random" and not (auto and not (folder / name).is_file()):
@@ -215,25 +195,25 @@ def _points(options: BlenderOptions, folder: Path, cameras: Sequence[Camera]) ->
     corner = torch.full((3,), options.points_bound, dtype=torch.float64)
     generator = torch.Generator().manual_seed(options.seed)
     far = any(origin_of_cameras(cameras, options.points_bound))
-    middle = point_looked_at(cameras) if far else torch.zeros_like(corner)
+    middle = focus_of(cameras) if far else torch.zeros_like(corner)
     cloud = random_points(options.random_points, middle - corner, middle + corner, generator)
-    about = f" about {in_words(middle.round(decimals=3).tolist())}, which the cameras look at" if far else ""
+    about = f" around {in_words(middle.round(decimals=3).tolist())}, the focus of the cameras" if far else ""
     cube = f"[-{options.points_bound}, {options.points_bound}]^3{about}"
     return cloud, f"Starts from {len(cloud)} random points in {cube}."
 
 
 def facts(path: Path) -> Iterator[str]:
-    """Yield how many images of each transforms file are there."""
+    """Yield a line on the images of each transforms file."""
     return (frames_line(file) for file in sorted(path.glob("transforms_*.json")) if not is_empty(file))
 
 
 def recognise(path: Path) -> bool:
-    """Return whether a folder has transforms_train.json, and that no other camera than an angle of view makes."""
+    """Recognise a folder with transforms_train.json whose cameras have nothing but an angle of view."""
     return (path / TRAIN_FILE).is_file() and not needs_lens(path / TRAIN_FILE)
 
 
 def overrides(path: Path) -> dict[str, str]:
-    """Return the split of a folder whose files hold none."""
+    """Return a split for a folder without a test file."""
     return {} if test_file(path) else {"split": "every:8"}
 
 

@@ -1,9 +1,8 @@
-"""BungeeNeRF cities, seen from the street to the sky, with every view labelled by its scale.
+"""BungeeNeRF cities from the street to the sky, with a label of scale for each view.
 
 Cameras come from a COLMAP model (as the Scaffold-GS and Octree-GS authors distribute these scenes) or, without one,
 from `poses_enu.json` of the original data (scaffold and octree spec, section 6). Scale-1 is the closest and scale-4
-the farthest: the columns of the published tables count 522 k Gaussians drawn at scale-1 and 5,821 k at scale-4, and
-only a distant camera sees the whole city.
+the farthest: by the published tables, 522 k Gaussians are drawn at scale-1 and 5,821 k at scale-4.
 
 Train and test views keep the order of the sorted file names, so the first n training cameras that the published
 augmentation uses are `scene.train[:n]`.
@@ -31,7 +30,7 @@ from gsx.scenes import colmap
 from gsx.scenes.colmap_folders import model_folders
 from gsx.scenes.duplicates import photos_of
 from gsx.scenes.masked import mask_notes
-from gsx.scenes.origin import moved, origin_of_cameras
+from gsx.scenes.origin import origin_of_cameras, relative_camera
 from gsx.scenes.points import grey_points, stored_points
 from gsx.scenes.pose_files import finite_number, pose_from_opengl, read_json
 from gsx.scenes.posed import Shot, check_sides, scene_of, views_of
@@ -50,24 +49,19 @@ RAYS_PER_POINT = 4  # some end in the sky
 class BungeeOptions(colmap.ColmapOptions):
     """Options of `conf/scene/bungee.yaml`.
 
-    `split` can be `lod:N` as well (Scaffold-GS): of the sorted images those up to number N are test and the rest
-    train, or from N = 50 on the other way round.
+    `split` can be `lod:N` as well (Scaffold-GS): the sorted images up to number N are test and the rest train, from
+    N = 50 on the reverse.
     """
 
     points: str
-    """For scenes without COLMAP model. random: in what the cameras see, up to 250 m high | a PLY file."""
+    """Initial points without a COLMAP model. random: in view of the cameras, up to 250 m high | a PLY file."""
     random_points: Points
     seed: Seed
-    """Of the random points."""
+    """Seed of the random points."""
 
 
 def load(options: BungeeOptions) -> Scene:
-    """Load a BungeeNeRF scene.
-
-    Raises:
-        ConfigError: the split rule cannot be read.
-        InputError: a file is missing or damaged, or there are fewer than two training images.
-    """
+    """Load a BungeeNeRF scene; ConfigError: the split cannot be read; InputError: a file is missing or damaged."""
     folder = expand_home(options.path)
     if model_folders(folder):
         scene = colmap.load(replace(options, split="none"))
@@ -81,23 +75,19 @@ def load(options: BungeeOptions) -> Scene:
     split = split_views([view.name for view in views], options.split, folder, photos_of(views))
     train, test = ([views[i] for i in side] for side in split)
     check_sides((train, test), folder)
+    listed = ", ".join(f"{group}: {count}" for group, count in sorted(Counter(view.group for view in views).items()))
     return replace(
         scene,
         train=train,
         test=test,
         extent=extent_of([view.camera for view in train]),
-        notes=[*scene.notes, _scale_note(views, basis)],
+        notes=[*scene.notes, f"Views of each scale, 1 closest (by {basis}): {listed}."],
         provenance={**scene.provenance, "format": options.name, "split": options.split, "scales": basis},
     )
 
 
 def split_views(names: Sequence[str], rule: str, folder: Path, photographs: Sequence[Path] = ()) -> Split:
-    """Return positions of training and test names by `lod:N`, or any rule of `gsx.scenes.splits`.
-
-    Raises:
-        ConfigError: the rule cannot be read, or looks at photographs where there are none.
-        InputError: it leaves no image to train on or none to test on.
-    """
+    """Return positions of training and test names by `lod:N`, or any rule of `split_names`, with its errors."""
     kind, _, number = rule.partition(":")
     if kind != "lod":
         return split_names(list(names), rule, folder, photographs)
@@ -112,12 +102,9 @@ def split_views(names: Sequence[str], rule: str, folder: Path, photographs: Sequ
 
 
 def load_enu(options: BungeeOptions, folder: Path) -> Scene:
-    """Return the scene of `poses_enu.json`, all views in `train`.
+    """Return the scene of `poses_enu.json`, all views in `train`; InputError: a file is missing or damaged.
 
     Poses are OpenGL camera-to-world in scaled east-north-up coordinates with the ground at height 0.
-
-    Raises:
-        InputError: a file is missing or damaged, or images and poses differ in number.
     """
     file = folder / POSES_FILE
     if not file.is_file():
@@ -127,10 +114,8 @@ def load_enu(options: BungeeOptions, folder: Path) -> Scene:
     content = read_json(file)
     poses, photos = _poses(content, file), image_files(folder / options.images)
     if len(photos) != len(poses):
-        raise InputError(
-            f"'{file}' has {len(poses)} poses and '{folder / options.images}' {len(photos)} images: put back the"
-            " images that belong to it."
-        )
+        images = f"'{folder / options.images}' {len(photos)} images"
+        raise InputError(f"'{file}' has {len(poses)} poses and {images}: restore the missing ones.")
     views = views_of([_shot(pose, photo, file) for pose, photo in zip(poses, photos, strict=True)], options)
     points, note = _points(views, content, options, file)
     notes = [f"Cameras come from {POSES_FILE}.", *mask_notes(views, options), note]
@@ -138,12 +123,13 @@ def load_enu(options: BungeeOptions, folder: Path) -> Scene:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Return the images of a folder sorted by name, which is from near to far in the original data."""
+    """Return the images of a folder by name, which in the original data is from near to far."""
     files = folder.iterdir() if folder.is_dir() else []
     return sorted(file for file in files if file.suffix.lower() in SUFFIXES)
 
 
 def _poses(content: dict[str, Any], file: Path) -> Float[Tensor, "N 17"]:
+    """Return the rows of a poses file, float64; InputError: they are no such numbers."""
     try:
         poses = torch.tensor(content.get("poses"), dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):
@@ -174,15 +160,13 @@ def _points(
         return stored_points(file.parent, options.points)
     scale = finite_number(content.get("scene_scale"))
     if scale is None or scale <= 0:
-        raise InputError(
-            f"'{file}' has scene_scale {reprlib.repr(content.get('scene_scale'))}, give a number above 0 or set "
-            "scene.points to a PLY file."
-        )
+        stated = reprlib.repr(content.get("scene_scale"))
+        raise InputError(f"'{file}' has scene_scale {stated}, give a number above 0 or set scene.points to a PLY file.")
     generator = torch.Generator().manual_seed(options.seed)
     cameras = [view.camera for view in views]
     x, y, _ = origin_of_cameras(cameras)
     below = (x, y, 0.0)  # heights count from the ground
-    local = [moved(camera, below) for camera in cameras]
+    local = [relative_camera(camera, below) for camera in cameras]
     cloud = city_points(local, options.random_points, BUILDING_HEIGHT * scale, generator)
     if any(below):
         cloud = grey_points(cloud.positions + torch.tensor(below, dtype=torch.float64))
@@ -192,10 +176,8 @@ def _points(
 def city_points(cameras: Sequence[Camera], count: int, height: float, generator: torch.Generator) -> PointCloud:
     """Return grey points where rays through random pixels of random cameras reach a random level in [0, `height`].
 
-    Points lie as densely as the cameras look, at all scales; none is farther from the origin than every camera.
-
-    Raises:
-        InputError: no ray comes down to the ground.
+    Their density follows the views, at all scales; none is farther from the origin than every camera. InputError: no
+    ray reaches the ground.
     """
     rays = count * RAYS_PER_POINT
     chosen = torch.randint(len(cameras), (rays,), generator=generator)
@@ -209,7 +191,7 @@ def city_points(cameras: Sequence[Camera], count: int, height: float, generator:
     positions = eyes[chosen] + depth[:, None] * way
     usable = (depth > 0) & (positions.norm(dim=1) <= eyes.norm(dim=1).max())
     if not usable.any():
-        raise InputError("No camera of the scene looks down on a city, set scene.points to a PLY file.")
+        raise InputError("No camera of the scene points down at a city, set scene.points to a PLY file.")
     return grey_points(positions[usable][:count])
 
 
@@ -221,23 +203,18 @@ def _pixel_to_ray(camera: Camera) -> Float[Tensor, "3 3"]:
 
 
 def _scales(views: Sequence[View], centre: Float[Tensor, "3"], folder: Path, images: str) -> tuple[list[int], str]:
-    """Return the scale of each view, from 1, and what it is based on."""
+    """Return the scale of each view, from 1, and its basis in words."""
     file = folder / POSES_FILE
     content = read_json(file) if file.is_file() else {}
     names = [photo.name for photo in image_files(folder / images)]
     if "scale_split" in content and len(names) == len(_poses(content, file)):
-        starts = _starts(content["scale_split"], file)
+        starts = content["scale_split"]  # numbers of the first image of each scale, farthest first
+        whole = isinstance(starts, list) and all(isinstance(start, int) for start in starts)
+        if not whole or starts != sorted(set(starts), reverse=True) or starts[-1:] != [0]:
+            raise InputError(f"'{file}' has scale_split {starts}, which must be whole numbers falling to 0.")
         return [scale_of_number(names.index(Path(view.name).name), starts) for view in views], f"{POSES_FILE}"
     distances = torch.stack([(view.camera.centre - centre).norm() for view in views])
     return scales_of_distances(distances), "four bins of equal width in log distance from the scene centre"
-
-
-def _starts(value: Any, file: Path) -> list[int]:
-    """Return the numbers of the first image of each scale, farthest scale first."""
-    whole = isinstance(value, list) and all(isinstance(start, int) for start in value)
-    if not whole or value != sorted(set(value), reverse=True) or value[-1:] != [0]:
-        raise InputError(f"'{file}' has scale_split {value}, which must be whole numbers falling to 0.")
-    return value
 
 
 def scale_of_number(number: int, starts: Sequence[int]) -> int:
@@ -253,11 +230,6 @@ def scales_of_distances(distances: Float[Tensor, "N"]) -> list[int]:
         return [1] * len(logs)
     bins = (SCALES * (logs - low) / (high - low)).long().clamp(max=SCALES - 1)
     return (bins + 1).tolist()
-
-
-def _scale_note(views: Sequence[View], basis: str) -> str:
-    listed = ", ".join(f"{group}: {count}" for group, count in sorted(Counter(view.group for view in views).items()))
-    return f"Views of each scale, 1 closest (by {basis}): {listed}."
 
 
 FORMAT = SceneFormat(

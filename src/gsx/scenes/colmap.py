@@ -20,7 +20,7 @@ from gsx.core.errors import InputError
 from gsx.core.files import expand_home, is_file
 from gsx.core.ranges import Range
 from gsx.core.shapes import Float
-from gsx.scenes.adjust import WHEN, adjusted, fit_line
+from gsx.scenes.adjust import WHEN, adjust_model, fit_line
 from gsx.scenes.colmap_folders import (
     AUTO,
     find_model,
@@ -63,16 +63,13 @@ class ColmapOptions(SceneOptions):
 
 
 def load(options: ColmapOptions) -> Scene:
-    """Load a COLMAP scene.
-
-    Raises:
-        InputError: no model or photos, a file is corrupt, sizes disagree, or the poses do not fit the observations.
-    """
-    path = expand_home(options.path)
+    """Load a COLMAP scene; InputError: a file is missing or corrupt, or the poses contradict the observations."""
+    path, images = expand_home(options.path), options.images
     folder, notes = find_model(path, options.model)
     stated = read_model(folder)
-    images = images_elsewhere(path, stated, options.images)
-    model, adjustment = adjusted(stated, options.adjust)
+    if images == IMAGES and not (folder in model_folders(path) and (path / IMAGES).is_dir()):
+        images = image_folder(path, stated)
+    model, adjustment = adjust_model(stated, options.adjust)
     notes += [f"Photos are those in {images}."] if images != options.images else []
     return build(model, path / images, replace(options, images=images), [*notes, *adjustment])
 
@@ -80,16 +77,12 @@ def load(options: ColmapOptions) -> Scene:
 def build(
     model: Model, photos: Path, options: ColmapOptions, notes: Sequence[str], turns_of: TurnsOf | None = None
 ) -> Scene:
-    """Return the scene of a model whose images are in the folder `photos`; `notes` come first among the scene's.
+    """Return the scene of a model with its images in the folder `photos`; InputError as `load`.
 
-    `turns_of` finds the turns of a photo; None: as `options.orientation` says.
-
-    Raises:
-        InputError: as `load`.
+    `notes` come first among the scene's; `turns_of` finds the turns of a photo (None: by `options.orientation`).
     """
-    path = expand_home(options.path)
-    present = present_images(model, photos, options.missing)
-    turns_of = turns_of or RULES[options.orientation]
+    path, turns_of = expand_home(options.path), turns_of or RULES[options.orientation]
+    present, absent_note = present_images(model, photos, options.missing)
     shots = [
         shot_through(
             model.cameras[image.camera_id], image.name, photos / image.name, image.rotation, image.translation, turns_of
@@ -101,12 +94,11 @@ def build(
     train, test = split_names([view.name for view in views], options.split, path, photos_of(views))
     sides = [views[index] for index in train], [views[index] for index in test]
     check_sides(sides, path)
-    notes = [*notes, *model.notes, *_missing_note(model, present), *shot_notes(shots), *mask_notes(views, options), fit]
-    bent = any(shot.remap is not None for shot in shots)
+    notes = [*notes, *model.notes, *absent_note, *shot_notes(shots), *mask_notes(views, options), fit]
     details = {
         "image_folder": Path(options.images).name,
         "camera_models": sorted({camera.model_name for camera in model.cameras.values()}),
-        "undistortion": METHOD if bent else None,
+        "undistortion": METHOD if any(shot.remap is not None for shot in shots) else None,
         **({} if options.adjust == "never" else {"adjust": options.adjust}),
     }
     return scene_of(options, path, views, sides, model.points, notes, details)
@@ -115,12 +107,8 @@ def build(
 # -- images ------------------------------------------------------------------------------------------------------------
 
 
-def present_images(model: Model, photos: Path, missing: float) -> list[ModelImage]:
-    """Return the images of the model whose photo exists.
-
-    Raises:
-        InputError: none or only one exists, more than the share `missing` does not, or two images are one file.
-    """
+def present_images(model: Model, photos: Path, missing: float) -> tuple[list[ModelImage], list[str]]:
+    """Return the images with a photo, and a note on the others; InputError: too few, or two are one file."""
     present = [image for image in model.images if is_file(photos / image.name)]
     if not present and model.images:
         names = [image.name for image in model.images]
@@ -137,17 +125,13 @@ def present_images(model: Model, photos: Path, missing: float) -> list[ModelImag
     hint = similar_photo(photos, absent) if len(absent) > missing * len(model.images) else ""
     refuse_partial(absent, len(model.images), model.folder, missing, remedy=hint or "complete them")
     refuse_file_twice([image.name for image in present], [photos / image.name for image in present], model.folder)
-    return present
+    note = f"Skipped {len(absent)} images whose photos are missing: {some_names(absent)}."
+    return present, [note] if absent else []
 
 
 def _absent(model: Model, present: Sequence[ModelImage]) -> list[str]:
-    """Return names of the images that are not among those present."""
+    """Return names of the other images."""
     return sorted({image.name for image in model.images} - {image.name for image in present})
-
-
-def _missing_note(model: Model, present: Sequence[ModelImage]) -> list[str]:
-    missing = _absent(model, present)
-    return [f"Skipped {len(missing)} images whose photos are missing: {some_names(missing)}."] if missing else []
 
 
 # -- cameras -----------------------------------------------------------------------------------------------------------
@@ -156,11 +140,7 @@ def _missing_note(model: Model, present: Sequence[ModelImage]) -> list[str]:
 def check_cameras(
     model: Model, images: Sequence[ModelImage], shots: Sequence[Shot], views: Sequence[View], limit: float
 ) -> str:
-    """Compare the cameras to train with against what the model observed; returns the result as a note.
-
-    Raises:
-        InputError: the median error exceeds `limit` pixels of the model, or (no observations) few points are in view.
-    """
+    """Compare the training cameras with the model's observations, and return a note; InputError: they disagree."""
     # views without their centring, if any: that is an approximation that the user chose, not a mistake
     sizes = [oriented_size(view.camera.size, shot.turns.last) for shot, view in zip(shots, views, strict=True)]
     cameras = [shot.whole.resize(*size) for shot, size in zip(shots, sizes, strict=True)]
@@ -172,28 +152,23 @@ def check_cameras(
         return _check_visible(model, cameras, rest)
     median = float(measured.median())
     if not median <= limit:
-        raise InputError(_misses(model, median, limit, rest))
+        behind = "have most of the points that they observe behind them"
+        missed = behind if math.isinf(median) else f"miss the observed keypoints by {median:.3g} px"
+        raise InputError(
+            f"The cameras of {model.folder} {missed} (median; the limit is scene.max_reprojection_px={limit:g}{rest}): "
+            "poses, intrinsics or files of different reconstructions are mixed. If they are only inexact, "
+            f"scene.adjust=auto estimates them anew from these observations.{model.conflict and ' '}{model.conflict}"
+        )
     return (
         f"Reprojection error {median:.2f} px (median of {len(measured)} observations, at the model's resolution){rest}."
-    )
-
-
-def _misses(model: Model, median: float, limit: float, rest: Unmeasured) -> str:
-    """Return the message for cameras whose median reprojection error exceeds the limit."""
-    behind = "have most of the points that they observe behind them"
-    missed = behind if math.isinf(median) else f"miss the observed keypoints by {median:.3g} px"
-    return (
-        f"The cameras of {model.folder} {missed} (median; the limit is scene.max_reprojection_px={limit:g}{rest}): "
-        "poses, intrinsics or files of different reconstructions are mixed. Where they are only inexact, "
-        f"scene.adjust=auto finds them anew from these observations.{model.conflict and ' '}{model.conflict}"
     )
 
 
 def reprojection_errors(image: ModelImage, intrinsics: Any, camera: Camera) -> Float[Tensor, "K"]:
     """Return distances of projected points from their keypoints in pixels of the model.
 
-    They are infinite for points behind the camera, and NaN for keypoints for which the lens has no ray. `camera` is
-    the image's pinhole camera on any raster, `intrinsics` the model's pycolmap camera.
+    Points behind the camera have infinity, keypoints without a ray NaN. `camera` is the image's pinhole camera on any
+    raster, `intrinsics` the model's pycolmap camera.
     """
     pinhole = pinhole_of(intrinsics)
     observed = straight_keypoints(image, intrinsics)
@@ -205,6 +180,7 @@ def reprojection_errors(image: ModelImage, intrinsics: Any, camera: Camera) -> F
 
 
 def _check_visible(model: Model, cameras: Sequence[Camera], rest: Unmeasured) -> str:
+    """Return a note on the share of points in view; InputError: it is below `MIN_VISIBLE_FRACTION`."""
     visible = torch.stack([camera.sees(model.points.positions) for camera in cameras]).any(dim=0)
     fraction = float(visible.double().mean())
     if fraction < MIN_VISIBLE_FRACTION:
@@ -212,8 +188,7 @@ def _check_visible(model: Model, cameras: Sequence[Camera], rest: Unmeasured) ->
             f"Only {fraction:.0%} of the points of {model.folder} are in view of any camera (at least "
             f"{MIN_VISIBLE_FRACTION:.0%} should be): points and poses belong to different reconstructions."
         )
-    without = "The model keeps no observations to check the cameras by"
-    why = "No keypoint can check the cameras" if rest.no_ray else without
+    why = "No keypoint can check the cameras" if rest.no_ray else "The model keeps no observations to check the cameras"
     return f"{why}; {fraction:.0%} of its points are in view{rest}."
 
 
@@ -221,7 +196,7 @@ def _check_visible(model: Model, cameras: Sequence[Camera], rest: Unmeasured) ->
 
 
 def facts(path: Path) -> Iterator[str]:
-    """Yield lines on the model, its cameras, and the images that are there."""
+    """Yield lines on the model, its cameras and its images."""
     folder = find_model(path)[0]
     model = read_model(folder)
     yield f"model     {folder}: {len(model.images)} images, {error_words(model.mean_error)}"
@@ -238,7 +213,7 @@ def facts(path: Path) -> Iterator[str]:
 
 
 def overrides(path: Path) -> dict[str, str]:
-    """Return the folder of the images, where that is another than usual."""
+    """Return the folder of the images, if that is not `images`."""
     images = image_folder(path, read_model(find_model(path)[0]))
     return {} if images == IMAGES else {"images": images}
 
@@ -246,7 +221,7 @@ def overrides(path: Path) -> dict[str, str]:
 def image_folder(path: Path, model: Model) -> str:
     """Return the folder with most of the model's images, relative to `path`; `images` where no folder has any.
 
-    Of several with as many it is the first whose photos have the size of their camera, or a uniform reduction of it.
+    Of equals it is the first whose photos have the size of their camera, or a uniform reduction of it.
     """
     for folders in (photo_folders(path, model.folder), photo_folders_above(path, model.folder)):
         counts = {folder: sum(is_file(folder / image.name) for image in model.images) for folder in folders}
@@ -259,7 +234,7 @@ def image_folder(path: Path, model: Model) -> str:
 
 
 def _fits(folder: Path, model: Model) -> bool:
-    """Compare the size of the first photo with its camera's."""
+    """Return whether the first photo has its camera's size or a reduction of it."""
     image = next(image for image in model.images if is_file(folder / image.name))
     camera, photo = model.cameras[image.camera_id], folder / image.name
     raster = camera.width, camera.height
@@ -268,14 +243,8 @@ def _fits(folder: Path, model: Model) -> bool:
     return False
 
 
-def images_elsewhere(path: Path, model: Model, images: str) -> str:
-    """Return the folder of the images: where none is set, that of a model in an unusual place is searched for."""
-    usual = model.folder in model_folders(path) and (path / IMAGES).is_dir()
-    return images if images != IMAGES or usual else image_folder(path, model)
-
-
 def recognise(path: Path) -> bool:
-    """Recognise a model in any of its places; a transforms.json is preferred to a model that it was made from."""
+    """Recognise a model in any of its places; a transforms.json comes before the model that it was made from."""
     if not path.is_dir():
         return False
     transforms = any((path / name).is_file() for name in ("transforms.json", "transforms_train.json"))

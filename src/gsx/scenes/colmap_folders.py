@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -13,30 +13,25 @@ from gsx.scenes.colmap_text import count_text_images
 REQUIRED = ("cameras", "images", "points3D")
 OPTIONAL = ("rigs", "frames")
 """Both or none; by COLMAP 4 they hold the poses."""
-SUFFIXES = (".bin", ".txt")
-"""Binary first, as 3D-GS."""
-AUTO = "auto"
-"""Value of scene.model: search for it."""
+SUFFIXES = (".bin", ".txt")  # binary first, as 3D-GS
+AUTO = "auto"  # value of scene.model: search
 
 PLACES = {
     "sparse", "colmap", "glomap", "hloc", "sfm", "dense", "distorted", "undistorted", "model", "models", "output",
     "outputs", "reconstruction", "reconstructions", "triangulated", "export", "poses",
 }  # fmt: skip
 """First or last words of folders in which COLMAP, INRIA's convert.py, hloc, GLOMAP, instant-ngp and nerfstudio keep
-models, apart from `sparse`."""
-DEPTH = 4
-"""Levels below a scene's folder: `dense/0/sparse/0`."""
-UNUSUAL_DEPTH = 3
-"""Levels below a folder of photos at which a model under any name is noticed."""
-MOST_FOLDERS = 1000
-"""Folders looked at in such a search."""
+models."""
+DEPTH = 4  # levels below a scene's folder: `dense/0/sparse/0`
+UNUSUAL_DEPTH = 3  # levels below a folder of photos at which a model under any name is noticed
+MOST_FOLDERS = 1000  # folders visited in such a search
 
 
 # -- files of one model ------------------------------------------------------------------------------------------------
 
 
 def model_files(folder: Path) -> dict[str, Path]:
-    """Return the files of a model by what they hold: binary where all are there, else text. Case is ignored.
+    """Return the files of a model by content: binary where all are there, else text. Case is ignored.
 
     `points3D` is a PLY where there is no other file of points: 3D-GS reads scenes without it.
 
@@ -44,17 +39,10 @@ def model_files(folder: Path) -> dict[str, Path]:
         InputError: a file is missing.
     """
     kinds = [_of_kind(folder, suffix) for suffix in SUFFIXES]
-    files = next((found for found in kinds if set(REQUIRED) <= found.keys()), None)
-    if files is None:
-        files = max(kinds, key=len)
-        ply = _listing(folder).get("points3d.ply")
-        if set(files) >= {"cameras", "images"} and ply is not None:
-            files["points3D"] = ply
-    _refuse_incomplete(folder, files)
-    return files
-
-
-def _refuse_incomplete(folder: Path, files: Mapping[str, Path]) -> None:
+    files = next((found for found in kinds if set(REQUIRED) <= found.keys()), None) or max(kinds, key=len)
+    ply = _listing(folder).get("points3d.ply")
+    if "points3D" not in files and set(files) >= {"cameras", "images"} and ply is not None:
+        files["points3D"] = ply
     suffix = next((file.suffix for file in files.values()), SUFFIXES[0])
     if lacking := [f"{name}{suffix}" for name in REQUIRED if name not in files]:
         other = [file.name for kind in SUFFIXES if kind != suffix for file in _of_kind(folder, kind).values()]
@@ -62,24 +50,24 @@ def _refuse_incomplete(folder: Path, files: Mapping[str, Path]) -> None:
         raise InputError(
             f"The COLMAP model {folder} lacks {' and '.join(lacking)}{mixed}: copy the whole model folder again."
         )
-    present = [name for name in OPTIONAL if name in files]
-    if len(present) == 1:
-        (absent,) = set(OPTIONAL) - set(present)
+    if len(optional := [name for name in OPTIONAL if name in files]) == 1:
+        present, (absent,) = files[optional[0]].name, set(OPTIONAL) - set(optional)
         raise InputError(
-            f"The COLMAP model {folder} has {files[present[0]].name} and lacks {absent}{suffix}: copy that as well, or "
-            f"remove {files[present[0]].name} to use the poses in {files['images'].name}."
+            f"The COLMAP model {folder} has {present} and lacks {absent}{suffix}: copy that as well, or remove "
+            f"{present} to use the poses in {files['images'].name}."
         )
+    return files
 
 
 def _of_kind(folder: Path, suffix: str) -> dict[str, Path]:
-    """Files of a model with that suffix, by what they hold."""
+    """Return the files of a model with that suffix, by content."""
     names = _listing(folder)
     found = {name: names.get(f"{name}{suffix}".lower()) for name in (*REQUIRED, *OPTIONAL)}
     return {name: file for name, file in found.items() if file is not None}
 
 
 def _listing(folder: Path) -> dict[str, Path]:
-    """Files that may be of a model, by name in lower case; of two that differ by case COLMAP's own comes first."""
+    """Return a model's files by name in lower case; of two that differ by case COLMAP's own comes first."""
     usual = {f"{name}{suffix}" for name in (*REQUIRED, *OPTIONAL) for suffix in (*SUFFIXES, ".ply")}
     known = {name.lower() for name in usual}
     found: dict[str, Path] = {}
@@ -104,52 +92,41 @@ def count_images(folder: Path) -> int:
 
 
 def find_model(path: Path, name: str = AUTO) -> tuple[Path, list[str]]:
-    """Return the model folder of a scene with the most images, and a note where there was a choice.
-
-    name: of the model folder, relative to `path`; `auto`: search.
-
-    Raises:
-        InputError: there is no model, or one lacks a file.
-    """
+    """Return the model folder `name`, or by `auto` that with the most images, and a note; InputError: none is whole."""
     if name != AUTO and not holds_model(path / name, 1):
         raise InputError(f"scene.model '{name}' is no folder with a COLMAP model in {path}: correct or omit it.")
     if name != AUTO:
         return path / name, []
-    folders = model_folders(path) or other_model_folders(path)
+    folders, counts = model_folders(path) or other_model_folders(path), dict[Path, int]()
     if not folders:
         raise InputError(
             f"No COLMAP model (cameras.bin or cameras.txt) in {path / 'sparse' / '0'}, {path / 'sparse'} or {path}: "
             "scene.path must be the folder that holds sparse/ and images/ (photos only: use scene=photos)."
         )
-    counts = {folder: _count_or_refuse(path, folder, folders) for folder in folders}
+    for folder in folders:
+        try:
+            counts[folder] = count_images(folder)
+        except InputError as problem:
+            others = " or ".join(place(path, other) for other in folders if other != folder)
+            raise InputError(f"{problem}{f' Or choose another model: scene.model={others}.' * bool(others)}") from None
     best = max(counts, key=lambda folder: counts[folder])  # max keeps the first of equals
     return best, [*_choice_note(path, best, counts)]
 
 
-def _count_or_refuse(path: Path, folder: Path, folders: Sequence[Path]) -> int:
-    try:
-        return count_images(folder)
-    except InputError as problem:
-        others = [place(path, other) for other in folders if other != folder]
-        remedy = f" Or choose another model: scene.model={' or '.join(others)}." if others else ""
-        raise InputError(f"{problem}{remedy}") from None
-
-
 def _choice_note(path: Path, best: Path, counts: Mapping[Path, int]) -> Iterator[str]:
+    """Yield a note where there was a choice of models, or the place is unusual."""
     elsewhere: dict[Path, int] = {}
     for folder in other_model_folders(path):
         with suppress(InputError):
             elsewhere[folder] = count_images(folder)
     larger = {folder: count for folder, count in elsewhere.items() if count > counts[best] and best not in elsewhere}
     others = {folder: count for folder, count in {**counts, **larger}.items() if folder != best}
+    used = f"Took the model {place(path, best)} with {counts[best]} images"
     if others:
         unused = ", ".join(f"{place(path, folder)} ({count})" for folder, count in others.items())
-        yield (
-            f"Took the model {place(path, best)} with {counts[best]} images; not used, with images: {unused} "
-            "(scene.model chooses)."
-        )
+        yield f"{used}; not used, with images: {unused} (scene.model chooses)."
     elif best not in model_folders(path):
-        yield f"Took the model {place(path, best)} with {counts[best]} images."
+        yield f"{used}."
 
 
 def place(path: Path, folder: Path) -> str:
@@ -176,7 +153,7 @@ def unusual_model_folders(path: Path) -> list[Path]:
 
 
 def _search(path: Path, levels: int, enter: Callable[[Path, int], bool]) -> list[Path]:
-    """Folders of models below `path`, level by level, inside of those that `enter` accepts."""
+    """Return folders of models below `path`, level by level, inside of those that `enter` accepts."""
     found, level, left = list[Path](), [path], MOST_FOLDERS
     for depth in range(levels):
         level = [inner for folder in level for inner in _inner(folder) if enter(inner, depth)][:left]
@@ -186,7 +163,7 @@ def _search(path: Path, levels: int, enter: Callable[[Path, int], bool]) -> list
 
 
 def _may_hold_model(folder: Path, depth: int) -> bool:
-    """Recognise a folder by its name; one that is a number, by its files where it may be another scene's."""
+    """Recognise a folder by its name; a number by its files, where it may be another scene's."""
     words = re.findall(r"[a-z]+", folder.name.lower())
     if not words:
         return folder.name.isdecimal() and (depth > 0 or holds_model(folder))
@@ -194,17 +171,14 @@ def _may_hold_model(folder: Path, depth: int) -> bool:
 
 
 def _inner(folder: Path) -> list[Path]:
-    """Folders inside of a folder that are not hidden, in order of name; none where it cannot be read."""
+    """Return folders inside of a folder that are not hidden, in order of name; none where it cannot be read."""
     with suppress(OSError):
         return sorted(inner for inner in folder.iterdir() if not inner.name.startswith(".") and inner.is_dir())
     return []
 
 
 def holds_model(folder: Path, texts: int = 2) -> bool:
-    """Recognise a model, perhaps an incomplete one: a binary file, cameras.txt, or so many text files.
-
-    Two, where other files may have such a name: a list of photos may be called images.txt.
-    """
+    """Recognise a model, perhaps an incomplete one: a binary file, cameras.txt, or this many text files."""
     binary, text = ([name for name in _of_kind(folder, suffix) if name in REQUIRED] for suffix in SUFFIXES)
     return bool(binary) or "cameras" in text or len(text) >= texts
 
@@ -213,26 +187,22 @@ def holds_model(folder: Path, texts: int = 2) -> bool:
 
 
 def photo_folders(path: Path, model: Path) -> list[Path]:
-    """Return the folders in which the photos of a model may lie, the likeliest first: near the model, then near `path`.
+    """Return folders that may hold the photos of a model, the likeliest first: near the model, then near `path`.
 
     The model of INRIA's `distorted` is that of the photos in `input`; `images` holds undistorted ones.
     """
     inner = Path(os.path.relpath(model, path)).parts
     bases = [Path(path, *inner[:count]) for count in range(len(inner) + 1)] if ".." not in inner else [path]
     usual = ("input", "images") if "distorted" in inner else ("images", "input")
-    near = [folder for base in reversed(bases) for folder in _near(base, usual)]
-    return list(dict.fromkeys(near))
+    found: list[Path] = []
+    for base in reversed(bases):
+        named = [base / name for name in usual if (base / name).is_dir()]
+        others = [folder for folder in _inner(base) if folder not in named]
+        found += [*named, *others, *(one / "images" for one in others if (one / "images").is_dir()), base]
+    return list(dict.fromkeys(found))
 
 
 def photo_folders_above(path: Path, model: Path) -> list[Path]:
     """Return such folders where `path` is the folder of a model, or of numbered ones, itself."""
     itself = model == path or (model.parent == path and model.name.isdecimal())
     return [Path(path, *[".."] * up, name) for up in (1, 2, 3) for name in ("images", "input")] if itself else []
-
-
-def _near(base: Path, usual: Sequence[str]) -> list[Path]:
-    """Folders for photos in a folder, and that folder itself."""
-    named = [base / name for name in usual if (base / name).is_dir()]
-    others = [folder for folder in _inner(base) if folder not in named]
-    inner = [folder / "images" for folder in others if (folder / "images").is_dir()]
-    return [*named, *others, *inner, base]

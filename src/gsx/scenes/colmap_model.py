@@ -38,7 +38,7 @@ QUATERNION_TOLERANCE = 0.01  # of its length, 1: text formats round
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ModelImage:
-    """A registered image and what it observed."""
+    """A registered image and its observations."""
 
     name: str
     """Path relative to the image folder, with `/`."""
@@ -50,9 +50,9 @@ class ModelImage:
     keypoints: Float[Tensor, "K 2"]
     """Observed positions in pixels of the model's camera, pixel centres at +0.5, float64; evenly drawn from all."""
     observed: Float[Tensor, "K 3"]
-    """The world points seen there, float64."""
+    """The world points at these keypoints, float64."""
     lost: int = 0
-    """Observations that are left out because their point has been removed from the model."""
+    """Number of observations without their point, which has been removed from the model."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -71,42 +71,44 @@ class Model:
 
 
 def read_model(folder: Path) -> Model:
-    """Read a model.
-
-    Raises:
-        InputError: a file is missing, truncated or corrupt, a camera model is unknown, or there are no points.
-    """
+    """Read a model; InputError: a file is missing or corrupt, a camera model is unknown, or there are no points."""
     file = model_files(folder)["points3D"]
     reconstruction, notes, conflict = reconstruction_of(folder)
-    read = _points_of_ply if file.suffix.lower() == ".ply" else _points
-    points, positions, point_notes = read(reconstruction, file)
-    mean_error, error_notes = stated_error(reconstruction)
+    notes += [conflict] * bool(conflict)
+    positions: Positions | None = None
+    if file.suffix.lower() == ".ply":  # which does not say which images observe its points
+        points = read_points(file)
+        why = "as there is no points3D.bin: cameras cannot be checked by observations"
+        notes.append(f"Points are those of {file.name}, {why}.")
+    else:
+        points, positions, dropped = _points(reconstruction, file)
+        notes += [f"Dropped {dropped} points with coordinates that are not finite."] * bool(dropped)
     registered = [reconstruction.image(number) for number in reconstruction.reg_image_ids()]
     images = sorted((_image(image, positions, file) for image in registered), key=lambda image: image.name)
+    if names := [image.name for image in images if image.lost]:  # as where a script has removed some
+        lost = f"Images observe points that {file.name} lacks, as where points were removed from it alone"
+        notes.append(f"{lost}: these observations are left out ({len(names)} images: {some_names(names)}).")
+    errors = np.array([point.error for point in reconstruction.points3D.values() if point.has_error()])
+    finite = errors[np.isfinite(errors)]
+    if left := len(errors) - len(finite):
+        notes.append(f"The mean reprojection error leaves out {left} points whose own is not finite.")
     return Model(
         folder=folder,
         cameras={number: copy.copy(camera) for number, camera in sorted(reconstruction.cameras.items())},
         images=images,
         points=points,
-        mean_error=mean_error,
-        notes=[*notes, *filter(None, [conflict]), *point_notes, *lost_note(images, file), *error_notes],
+        mean_error=float(finite.mean()) if len(finite) else math.nan,
+        notes=notes,
         conflict=conflict,
     )
-
-
-def lost_note(images: Sequence[ModelImage], file: Path) -> list[str]:
-    """Return a note on points that images observe and the file of points lacks, as where a script has removed some."""
-    names = [image.name for image in images if image.lost]
-    lost = f"Images observe points that {file.name} lacks, as where points were removed from it alone"
-    return [f"{lost}: these observations are left out ({len(names)} images: {some_names(names)})."] if names else []
 
 
 Positions = Mapping[int, Float[Tensor, "3"]]
 """World points by their id, float64."""
 
 
-def _points(reconstruction: Any, file: Path) -> tuple[PointCloud, Positions, list[str]]:
-    """Points of a model, all positions by id, and a note on those that are dropped."""
+def _points(reconstruction: Any, file: Path) -> tuple[PointCloud, Positions, int]:
+    """Return the finite points of a model, all positions by id, and the number of points left out."""
     numbers = sorted(reconstruction.points3D)
     points = [reconstruction.point3D(number) for number in numbers]
     positions = _stack([point.xyz for point in points], 3)
@@ -116,36 +118,19 @@ def _points(reconstruction: Any, file: Path) -> tuple[PointCloud, Positions, lis
             f"{file} holds no points with finite coordinates, but training starts from points: "
             "triangulate the model (colmap point_triangulator) or reconstruct the photos with scene=photos."
         )
-    dropped = int((~usable).sum())
     colours = torch.from_numpy(np.array([point.color for point in points]))
-    notes = [f"Dropped {dropped} points with coordinates that are not finite."] if dropped else []
     cloud = PointCloud(in_single_where_resolved(positions[usable]), colours[usable])
-    return cloud, dict(zip(numbers, positions, strict=True)), notes
-
-
-def _points_of_ply(reconstruction: Any, file: Path) -> tuple[PointCloud, None, list[str]]:
-    """Points of a PLY, which does not say which images observe them."""
-    cloud = read_points(file)
-    note = f"Points are those of {file.name}, as there is no points3D.bin: cameras cannot be checked by observations."
-    return cloud, None, [note]
-
-
-def stated_error(reconstruction: Any) -> tuple[float, list[str]]:
-    """Return the mean reprojection error that points state, px, and a note on those that state no number."""
-    errors = np.array([point.error for point in reconstruction.points3D.values() if point.has_error()])
-    finite = errors[np.isfinite(errors)]
-    left = f"The mean reprojection error leaves out {len(errors) - len(finite)} points whose own is not finite."
-    return float(finite.mean()) if len(finite) else math.nan, [left] if len(finite) < len(errors) else []
+    return cloud, dict(zip(numbers, positions, strict=True)), int((~usable).sum())
 
 
 def error_words(mean_error: float) -> str:
-    """Return the mean reprojection error of a model in words; NaN: it states none."""
+    """Describe the mean reprojection error of a model; NaN: it states none."""
     return "no reprojection error stated" if math.isnan(mean_error) else f"mean reprojection error {mean_error:.2f} px"
 
 
 @contextmanager
 def binary_model(files: Mapping[str, Path]) -> Iterator[tuple[Path, list[str]]]:
-    """Yield a folder with the binary files of a model under COLMAP's names, and notes on what its text states."""
+    """Yield a folder with the binary files of a model under COLMAP's names, and notes on its text."""
     folders = {file.parent for file in files.values()}
     if all(file.name == f"{name}.bin" for name, file in files.items()) and len(folders) == 1:
         yield folders.pop(), []
@@ -163,7 +148,7 @@ def binary_model(files: Mapping[str, Path]) -> Iterator[tuple[Path, list[str]]]:
 
 
 def reconstruction_of(folder: Path) -> tuple[Any, list[str], str]:
-    """Return the pycolmap.Reconstruction of a model folder, notes on its text, and a note on poses, empty if all agree.
+    """Read a folder as pycolmap.Reconstruction; returns it, notes, and a note on contradictory poses.
 
     Raises:
         InputError: a file is missing, truncated or corrupt, or files contradict each other.
@@ -179,20 +164,15 @@ def reconstruction_of(folder: Path) -> tuple[Any, list[str], str]:
         try:
             found = pycolmap.Reconstruction(binary)
         except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as problem:
+            remedy = "copy or make the model again"
+            if "frames" in files:
+                poses, frames, rigs = (files[name].name for name in ("images", "frames", "rigs"))
+                remedy += f", or remove {frames} and {rigs} to use the poses in {poses}"
             raise InputError(
                 f"pycolmap cannot read the COLMAP model {folder} ({', '.join(file.name for file in files.values())}): "
-                f"{contradiction(binary) or unmatched(binary) or plain(problem)}; {remedy_of(files)}."
+                f"{contradiction(binary) or unmatched(binary) or plain(problem)}; {remedy}."
             ) from None
         return found, notes, pose_conflict(binary, files, found)
-
-
-def remedy_of(files: Mapping[str, Path]) -> str:
-    """Return what to do about a model that cannot be read."""
-    again = "copy or make the model again"
-    if "frames" not in files:
-        return again
-    poses, frames, rigs = (files[name].name for name in ("images", "frames", "rigs"))
-    return f"{again}, or remove {frames} and {rigs} to use the poses in {poses}"
 
 
 def plain(problem: Exception) -> str:
@@ -202,7 +182,7 @@ def plain(problem: Exception) -> str:
 
 
 def _usable(positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
-    """Which points are finite in float32; false for NaN as well."""
+    """Return which points are finite in float32; false for NaN as well."""
     return (positions.abs() <= torch.finfo(torch.float32).max).all(dim=1)
 
 
@@ -210,27 +190,24 @@ def _image(image: Any, positions: Positions | None, file: Path) -> ModelImage:
     """Return an image with its observations (None: without); InputError for a point that `file`, a text, lacks."""
     indices = [] if positions is None else image.get_observation_point2D_idxs()
     step = -(-len(indices) // OBSERVATIONS_PER_IMAGE) or 1
-    seen = [image.point2D(index) for index in indices[::step]]
-    positions = positions or {}
-    lost = [point.point3D_id for point in seen if point.point3D_id not in positions]
+    drawn, positions = [image.point2D(index) for index in indices[::step]], positions or {}
+    lost = [point.point3D_id for point in drawn if point.point3D_id not in positions]
     name = _name(image, file)
     if lost and file.suffix.lower() == ".txt":  # a binary file states how many points it has
         raise InputError(f"{file} is truncated: {name} observes its point {lost[0]}; copy or make the model again.")
-    seen = [point for point in seen if point.point3D_id in positions]
-    observed = _stack([positions[point.point3D_id] for point in seen], 3)
+    keypoints = [point for point in drawn if point.point3D_id in positions]
+    observed = _stack([positions[point.point3D_id] for point in keypoints], 3)
     usable, pose = _usable(observed), image.cam_from_world()
     length = pose.rotation.norm()
     if not abs(length - 1) <= QUATERNION_TOLERANCE:
-        raise InputError(
-            f"The model {file.parent} turns {name} by a quaternion of length {length:.3g} instead of 1: correct its "
-            "pose, or make the model again."
-        )
+        quaternion = f"a quaternion of length {length:.3g} instead of 1"
+        raise InputError(f"The model {file.parent} turns {name} by {quaternion}: correct its pose.")
     return ModelImage(
         name=name,
         camera_id=image.camera_id,
         rotation=torch.from_numpy(pose.rotation.matrix().copy()),
         translation=torch.from_numpy(pose.translation.copy()),
-        keypoints=_stack([point.xy for point in seen], 2)[usable],
+        keypoints=_stack([point.xy for point in keypoints], 2)[usable],
         observed=observed[usable],
         lost=len(lost),
     )
@@ -241,12 +218,10 @@ def _name(image: Any, file: Path) -> str:
     try:
         return str(image.name).replace("\\", "/")
     except UnicodeDecodeError as error:
-        raise InputError(
-            f"The model {file.parent} names an image by bytes that are no UTF-8 ({error.object!r}): rename the photo, "
-            "and reconstruct again."
-        ) from None
+        name = f"bytes that are no UTF-8 ({error.object!r})"
+        raise InputError(f"The model {file.parent} names an image by {name}: rename the photo.") from None
 
 
 def _stack(rows: Sequence[Any], width: int) -> Float[Tensor, "K W"]:
-    """Rows of numbers as a float64 matrix, also when there are none."""
+    """Stack rows of numbers to a float64 matrix, even none."""
     return torch.from_numpy(np.array(rows, dtype=np.float64).reshape(-1, width))

@@ -1,9 +1,9 @@
-"""Binary records of COLMAP models: how they lie in a file, and the walk that finds where a file is cut or foreign."""
+"""Binary records of COLMAP models: their layout, and the walk that finds where a file is cut or foreign."""
 
 import mmap
 import struct
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -15,20 +15,19 @@ RIG_REFERENCE, POSE, FRAME_DATA = 8, 56, 16  # bytes: (type, id); quaternion and
 IMAGE_HEAD, KEYPOINT = 64, 24  # bytes: id, quaternion, translation, camera id; x, y, point id
 POINT_HEAD, TRACK_ELEMENT = 43, 8  # bytes: id, xyz, rgb, error; image id, keypoint index
 
-LARGEST_SIDE = 2**20
-"""Largest side of a photo, px: larger numbers are mistakes, and COLMAP undistorts borders pixel by pixel."""
+LARGEST_SIDE = 2**20  # px of a photo: larger numbers are mistakes, and COLMAP undistorts borders pixel by pixel
 Bytes = bytes | mmap.mmap
 
 
 def check_binary(name: str, file: Path) -> None:
-    """Walk a binary file to its end; name: of what it holds, such as `cameras`.
+    """Walk a file of `cameras`, `images` ... to its end; InputError: it is cut off, too long or of unknown content."""
+    size, remedy = file.stat().st_size, "copy or make the model again"
 
-    Raises:
-        InputError: it ends within a record or goes on after the last, or a camera model is unknown to pycolmap.
-    """
-    size = file.stat().st_size
+    def truncated(index: int, count: int) -> InputError:
+        return InputError(f"{file} is truncated: its {size} bytes end within record {index} of {count}; {remedy}.")
+
     if size < U64.size:
-        raise _truncated(file, 0, 0)
+        raise truncated(0, 0)
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         (count,) = U64.unpack_from(data, 0)
         at = U64.size
@@ -36,23 +35,21 @@ def check_binary(name: str, file: Path) -> None:
             try:
                 at = SKIPS[name](data, at)
             except struct.error:
-                raise _truncated(file, index, count) from None
+                raise truncated(index, count) from None
             except ValueError as problem:
                 raise InputError(f"{file} is corrupt at record {index}: {problem}; make the model again.") from None
             if at > size:
-                raise _truncated(file, index, count)
+                raise truncated(index, count)
     if at < size:
-        raise InputError(
-            f"{file} goes on for {size - at} bytes after its {count} records: its count is wrong or its end foreign, "
-            "copy or make the model again."
-        )
+        raise InputError(f"{file} goes on for {size - at} bytes after its {count} records: {remedy}.")
 
 
-def _truncated(file: Path, index: int, count: int) -> InputError:
-    size = file.stat().st_size
-    return InputError(
-        f"{file} is truncated: its {size} bytes end within record {index} of {count}; copy or make the model again."
-    )
+def records(name: str, data: Bytes) -> Iterator[int]:
+    """Yield the place of each record in a file that `check_binary` accepts."""
+    at = U64.size
+    for _ in range(U64.unpack_from(data, 0)[0]):
+        yield at
+        at = SKIPS[name](data, at)
 
 
 def _skip_camera(data: Bytes, at: int) -> int:
@@ -68,7 +65,7 @@ def _skip_camera(data: Bytes, at: int) -> int:
 
 @cache
 def camera_models() -> dict[int, tuple[str, int]]:
-    """Name and number of parameters of each camera model that pycolmap knows, by its number in files."""
+    """Return (name, number of parameters) of each camera model that pycolmap knows, by its number in files."""
     import pycolmap
 
     members = {int(member): name for name, member in pycolmap.CameraModelId.__members__.items() if int(member) >= 0}
@@ -84,11 +81,6 @@ def _skip_image(data: Bytes, at: int) -> int:
     return int(end + 1 + U64.size + KEYPOINT * keypoints)
 
 
-def _skip_point(data: Bytes, at: int) -> int:
-    (track,) = U64.unpack_from(data, at + POINT_HEAD)
-    return int(at + POINT_HEAD + U64.size + TRACK_ELEMENT * track)
-
-
 def _skip_rig(data: Bytes, at: int) -> int:
     _, sensors = RIG.unpack_from(data, at)
     at += RIG.size + (RIG_REFERENCE if sensors else 0)
@@ -98,13 +90,13 @@ def _skip_rig(data: Bytes, at: int) -> int:
     return at
 
 
-def _skip_frame(data: Bytes, at: int) -> int:
-    return int(at + FRAME.size + FRAME_DATA * FRAME.unpack_from(data, at)[-1])
-
-
 SKIPS: dict[str, Callable[[Bytes, int], int]] = {
-    "cameras": _skip_camera, "images": _skip_image, "points3D": _skip_point, "rigs": _skip_rig, "frames": _skip_frame,
-}  # fmt: skip
+    "cameras": _skip_camera,
+    "images": _skip_image,
+    "points3D": lambda data, at: int(at + POINT_HEAD + 8 + TRACK_ELEMENT * U64.unpack_from(data, at + POINT_HEAD)[0]),
+    "rigs": _skip_rig,
+    "frames": lambda data, at: int(at + FRAME.size + FRAME_DATA * FRAME.unpack_from(data, at)[-1]),
+}
 """Functions that return the end of the record that begins at a place."""
 
 
@@ -120,8 +112,9 @@ REFERENCES = {"images": "cameras", "frames": "rigs"}
 
 
 def contradiction(folder: Path) -> str:
-    """Return what is wrong with the ids in the binary files of a model, in words; empty: nothing that is known."""
-    heads = {name: _heads(name, folder / f"{name}.bin") for name in HEADS if (folder / f"{name}.bin").is_file()}
+    """Describe what is wrong with the ids in the binary files of a model; empty: nothing."""
+    files = {name: (folder / f"{name}.bin").read_bytes() for name in HEADS if (folder / f"{name}.bin").is_file()}
+    heads = {name: [HEADS[name].unpack_from(data, at) for at in records(name, data)] for name, data in files.items()}
     for name, rows in heads.items():
         ids = Counter(row[0] for row in rows)
         if twice := [number for number, count in ids.items() if count > 1]:
@@ -132,12 +125,3 @@ def contradiction(folder: Path) -> str:
             number, reference = lacking[0]
             return f"entry {number} of {name} refers to {reference} of {other}, which is not there"
     return ""
-
-
-def _heads(name: str, file: Path) -> list[tuple[int, ...]]:
-    """Ids at the beginning of each record of a file that `check_binary` accepts."""
-    data, at, rows = file.read_bytes(), U64.size, list[tuple[int, ...]]()
-    for _ in range(U64.unpack_from(data, 0)[0]):
-        rows.append(HEADS[name].unpack_from(data, at))
-        at = SKIPS[name](data, at)
-    return rows

@@ -17,18 +17,14 @@ from gsx.core.errors import InputError, nearest
 from gsx.scenes.colmap_records import FRAME, ID_MODEL_SIZE, LARGEST_SIDE, U64, camera_models
 
 KEYPOINTS = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
-NO_POINT = 2**64 - 1
-"""Point id of a keypoint that observes no point; -1 in text."""
-NAME_AT = 9
-"""Numbers before the name of an image."""
-BLANKS = " \t\r\n"
-"""Around words. Other characters that Python strips may be part of a name."""
-STATED = re.compile(r"#\s*Number of \w+:\s*(\d+)")
-"""The comment in which COLMAP states how many records a file has."""
+NO_POINT = 2**64 - 1  # point id of a keypoint that observes no point; -1 in text
+NAME_AT = 9  # numbers before the name of an image
+BLANKS = " \t\r\n"  # around words; other characters that Python strips may be part of a name
+STATED = re.compile(r"#\s*Number of \w+:\s*(\d+)")  # comment in which COLMAP states the number of records
 
 
 def write_as_binary(files: Mapping[str, Path], folder: Path) -> list[str]:
-    """Write the binary files of a text model to `folder`; files: by what they hold (`cameras`, `images`, ...).
+    """Write the binary files of a text model to `folder`; `files` by content (`cameras`, `images`, ...).
 
     Returns a note for each file that holds another number of records than its comments state.
 
@@ -39,8 +35,10 @@ def write_as_binary(files: Mapping[str, Path], folder: Path) -> list[str]:
     for name, file in files.items():
         records = list(records_of(file, READERS[name]))
         (folder / f"{name}.bin").write_bytes(U64.pack(len(records)) + b"".join(records))
-        stated = stated_count(file)
-        if stated is not None and stated != len(records):
+        with file.open(encoding="utf-8-sig", errors="replace") as stream:
+            top = takewhile(lambda line: line.startswith("#"), stream)
+            stated = next((int(found[1]) for line in top if (found := STATED.match(line))), len(records))
+        if stated != len(records):
             notes.append(f"{file.name} states {stated} {name} and holds {len(records)}.")
     return notes
 
@@ -49,9 +47,8 @@ class Lines:
     """Lines of a text file without comments and blanks at their ends; with or without a byte order mark."""
 
     def __init__(self, file: Path, errors: str = "strict") -> None:
-        self.file, self.errors = file, errors
-        self.number = 0
-        """Number of the latest line, from 1."""
+        self.file, self.errors, self.number = file, errors, 0
+        """File, treatment of bytes that are no UTF-8, and number of the latest line, from 1."""
 
     def __iter__(self) -> Iterator[str]:
         with self.file.open(encoding="utf-8-sig", errors=self.errors) as stream:
@@ -72,22 +69,13 @@ def records_of(file: Path, read: Reader) -> Iterator[bytes]:
         yield from read(lines)
     except UnicodeDecodeError as problem:
         odd = problem.object[problem.start : problem.start + 8]
-        raise InputError(
-            f"{file} holds bytes that are no UTF-8 ({odd!r}, after line {lines.number}): save it as UTF-8, or rename "
-            "the photos and reconstruct again."
-        ) from None
+        place = f"({odd!r}, after line {lines.number})"
+        raise InputError(f"{file} holds bytes that are no UTF-8 {place}: save it as UTF-8.") from None
     except (ValueError, OverflowError, struct.error) as problem:
         end = "" if str(problem).endswith(("?", ".")) else "."
         raise InputError(
             f"{file} cannot be read at line {lines.number}: {problem}{end} Correct it, or make the model again."
         ) from None
-
-
-def stated_count(file: Path) -> int | None:
-    """Return the number of records that the comments at the top of a file state; None: they state none."""
-    with file.open(encoding="utf-8-sig", errors="replace") as stream:
-        top = takewhile(lambda line: line.startswith("#"), stream)
-        return next((int(found[1]) for line in top if (found := STATED.match(line))), None)
 
 
 def count_text_images(file: Path) -> int:
@@ -99,10 +87,9 @@ def text_poses(file: Path) -> Iterator[tuple[str, np.ndarray]]:
     """Yield (name, quaternion w, x, y, z and translation) of each image of an images.txt; damaged lines are skipped."""
     for header, _ in _image_lines(Lines(file, errors="replace")):
         *numbers, name = _header_words(header)
-        if len(numbers) < NAME_AT:  # a list of photos of another program
-            continue
         with suppress(ValueError):
-            yield name, _floats(numbers[1:8])
+            if len(numbers) == NAME_AT:  # else a list of photos of another program
+                yield name, _floats(numbers[1:8])
 
 
 # -- records -----------------------------------------------------------------------------------------------------------
@@ -197,23 +184,17 @@ def _points(lines: Lines) -> Iterator[bytes]:
 def _rigs(lines: Lines) -> Iterator[bytes]:
     for identity, count, *words in _rows(lines, 2, "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[]"):
         record = struct.pack("<II", _whole(identity), _whole(count))
-        if _whole(count):
+        for index in range(_whole(count)):  # the first is the reference, without a pose
+            posed = index > 0 and words[2:3] == ["1"]
+            end = 10 if posed else 3 if index else 2
             record += _sensor(words)
-            words = words[2:]
-        for _ in range(_whole(count) - 1):
-            sensor, words = _posed_sensor(words)
-            record += sensor
-        _refuse_rest(words)
+            if len(words) < end:
+                raise ValueError("it ends within a sensor")
+            record += struct.pack("<?", posed) + _floats(words[3:end]).tobytes() if index else b""
+            words = words[end:]
+        if words:
+            raise ValueError(f"{len(words)} words are left over at its end")
         yield record
-
-
-def _posed_sensor(words: list[str]) -> tuple[bytes, list[str]]:
-    """Return a sensor with its pose, if it has one, and the words after it."""
-    posed = words[2:3] == ["1"]
-    end = 10 if posed else 3
-    if len(words) < end:
-        raise ValueError("it ends within a sensor")
-    return _sensor(words) + struct.pack("<?", posed) + _floats(words[3:end]).tobytes(), words[end:]
 
 
 def _sensor(words: Sequence[str]) -> bytes:
@@ -229,11 +210,10 @@ def _sensor(words: Sequence[str]) -> bytes:
 def _frames(lines: Lines) -> Iterator[bytes]:
     for words in _rows(lines, 10, "FRAME_ID, RIG_ID, RIG_FROM_WORLD[], NUM_DATA_IDS, DATA_IDS[]"):
         count, data = _whole(words[9]), words[10:]
-        _refuse_rest(data[3 * count :])
+        if len(data) != 3 * count:
+            raise ValueError(f"it lists {len(data) / 3:.3g} of {count} images")
         record = FRAME.pack(_whole(words[0]), _whole(words[1]), *_floats(words[2:9]), count)
         for first in range(0, 3 * count, 3):
-            if len(data) < first + 3:
-                raise ValueError(f"it lists {len(data) // 3} of {count} images")
             record += _sensor(data[first:]) + U64.pack(_whole(data[first + 2]))
         yield record
 
@@ -258,7 +238,7 @@ def _rows(lines: Lines, least: int, columns: str) -> Iterator[list[str]]:
 
 def _whole(word: str) -> int:
     """Return a whole number, also one that is written `12.0`; ValueError: it is none, or negative."""
-    number = int(word) if word.isdecimal() else _float(word)
+    number = int(word) if word.isdecimal() else float(word)
     if not (0 <= number < 2.0**63 and number == int(number)):
         raise ValueError(f"'{word}' is no whole number of 0 or more")
     return int(number)
@@ -266,16 +246,4 @@ def _whole(word: str) -> int:
 
 def _floats(words: Sequence[str]) -> np.ndarray:
     """Return numbers, float64."""
-    return np.array([_float(word) for word in words], dtype="<f8")
-
-
-def _float(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        raise ValueError(f"'{word}' is no number") from None
-
-
-def _refuse_rest(words: Sequence[str]) -> None:
-    if words:
-        raise ValueError(f"{len(words)} words are left over at its end")
+    return np.array([float(word) for word in words], dtype="<f8")

@@ -1,4 +1,4 @@
-"""The same photograph under two names, by which what is tested on could be trained on."""
+"""Photographs under two names, by which test photographs could be trained on."""
 
 import hashlib
 import os
@@ -9,14 +9,12 @@ from pathlib import Path
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError
 
-BLOCK = 1 << 16
-"""Bytes read at the beginning, in the middle and at the end of files of equal size before they are read whole."""
-Sides = tuple[list[Path], list[Path]]
-"""Photographs to train on, and those to test on, of which some may be the same."""
+BLOCK = 1 << 16  # bytes at the beginning, middle and end that are compared before whole files
+Sides = tuple[list[Path], list[Path]]  # photographs to train on, and to test on
 
 
 def refuse_file_twice(names: Sequence[str], photos: Sequence[Path], place: Path) -> None:
-    """Raise InputError if two of the names that `place` gives are one path: `a/../b`, or a suffix left out."""
+    """Raise InputError if two of the names in `place` are one path: `a/../b`, or without a suffix."""
     known: dict[str, str] = {}
     for name, photo in zip(names, photos, strict=True):
         path = os.path.abspath(photo)
@@ -27,9 +25,9 @@ def refuse_file_twice(names: Sequence[str], photos: Sequence[Path], place: Path)
 
 
 def refuse_shared(train: Sequence[View], test: Sequence[View], place: Path) -> None:
-    """Raise InputError if a photograph to test on is trained on: the file itself, or one with the same bytes.
+    """Raise InputError if a test photograph is trained on: the file itself, or one with the same bytes.
 
-    Only files of equal size are opened, and only those read whole that are alike at three places.
+    Only files of equal size are opened, and only those read whole that agree at three places.
     """
     candidates: list[Sides] = [(photos_of(train), photos_of(test))]
     for key in (size, digest_of_parts, digest):
@@ -44,16 +42,12 @@ def refuse_shared(train: Sequence[View], test: Sequence[View], place: Path) -> N
 
 
 def photos_of(views: Iterable[View]) -> list[Path]:
-    """Return the files that views are read from, each once."""
+    """Return the files of views, each once."""
     return list(dict.fromkeys(view.file for view in views if view.file is not None))
 
 
 def alike(candidates: Sides, key: Callable[[Path], Hashable]) -> list[Sides]:
-    """Group candidates by equal `key`, and return the groups with photos of both sides.
-
-    Raises:
-        InputError: a file cannot be read.
-    """
+    """Return groups of candidates of equal `key` with photos of both sides; InputError: a file cannot be read."""
     groups: dict[Hashable, Sides] = defaultdict(lambda: ([], []))
     for side, photos in enumerate(candidates):
         for photo in photos:

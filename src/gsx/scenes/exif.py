@@ -1,4 +1,4 @@
-"""Facts about photos from EXIF alone: which way up they are, and what took them."""
+"""Facts about photos from EXIF: orientation and lens."""
 
 import math
 from pathlib import Path
@@ -7,13 +7,11 @@ from gsx.core.data.images import header_of
 
 Lens = tuple[str, str, float, float]
 """Maker, model, focal length in mm, and that of the same view on 35 mm film; empty or 0 where a file lacks it."""
-
 NO_LENS: Lens = ("", "", 0.0, 0.0)
-"""Lens of files that state nothing."""
 
 
 def lens_of(path: str | Path) -> Lens:
-    """Return what took a photo; InputError: the file is missing or is no image."""
+    """Return the lens of a photo; InputError: the file is missing or is no image."""
     spec = header_of(path)
     maker, model = (spec.get_string_attribute(name, "") for name in ("Make", "Model"))
     lengths = [spec.get_float_attribute(f"Exif:{name}", 0.0) for name in ("FocalLength", "FocalLengthIn35mmFilm")]
@@ -22,6 +20,6 @@ def lens_of(path: str | Path) -> Lens:
 
 
 def orientation_of(path: str | Path) -> int:
-    """Return the EXIF orientation, 1 to 8; 1 (as stored) where a file states none, or no such number."""
+    """Return the EXIF orientation, 1 to 8; 1 (as stored): the file has none, or no such number."""
     value = int(header_of(path).get_int_attribute("Orientation", 1))
     return value if 1 <= value <= 8 else 1

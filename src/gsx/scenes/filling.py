@@ -1,6 +1,6 @@
-"""Points where structure from motion has found none: plain walls, sky between leaves, what few photographs show.
+"""Points where structure from motion finds none: plain walls, sky between leaves, places in few photographs.
 
-Depths are carried over from points that are seen nearby in the same picture.
+Depths are interpolated from points nearby in the same picture.
 """
 
 import math
@@ -13,22 +13,16 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.shapes import Bool, Float, Int
 
-NEIGHBOURS = 3
-"""Points that a depth is carried over from."""
-COVERED = 8
-"""Among so many nearest ones in the picture a point is hidden that lies much farther than the nearest of them."""
-BEHIND = 1.3
-"""So many times as far."""
-MOST_DISTANCES = 1 << 28
-"""Between points of a picture, at a time: 1 GB."""
-TRIES = 8
-"""Pixels that are tried for each point that is asked for."""
-FEWEST = 16
-"""Points that a picture has to show to tell anything of depth."""
+NEIGHBOURS = 3  # points from which a depth is interpolated
+COVERED = 8  # neighbours in the picture that may hide a point
+BEHIND = 1.3  # a point this many times as far as the nearest of them is hidden
+MOST_DISTANCES = 1 << 28  # between points of a picture, at a time: 1 GB
+TRIES = 8  # pixels for each point to add
+FEWEST = 16  # points in a picture from which depths can be interpolated
 
 
-def filled(scene: Scene, count: int, generator: torch.Generator) -> Scene:
-    """The scene with at most so many points more, with a note; each training view adds as many as the others."""
+def fill_gaps(scene: Scene, count: int, generator: torch.Generator) -> Scene:
+    """Add up to `count` points to a scene, equally many from each training view, and a note."""
     share = math.ceil(TRIES * count / len(scene.train))
     clouds = [found for view in scene.train if (found := gaps_of(view, scene.points, share, generator)) is not None]
     if not clouds:
@@ -45,37 +39,39 @@ def filled(scene: Scene, count: int, generator: torch.Generator) -> Scene:
 def gaps_of(
     view: View, points: PointCloud, count: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "P 3"], Tensor] | None:
-    """(positions, colours) of random pixels of a view that are farther from its points than these are from each other
-    on average; None: it shows too few points."""
+    """Return (positions, colours) of random pixels of a view that are farther from its points than their mean distance.
+
+    None: the view has too few points.
+    """
     camera = view.camera
     pixels, depths = in_view(camera, points.positions)
     if len(pixels) < FEWEST:
         return None
-    shown = in_front(pixels, depths)
-    pixels, depths = pixels[shown], depths[shown]
+    visible = in_front(pixels, depths)
+    pixels, depths = pixels[visible], depths[visible]
     size = torch.tensor(camera.size, dtype=torch.float32)
-    asked = torch.rand(count, 2, generator=generator) * size
-    apart, nearest = nearest_of(asked, pixels, min(NEIGHBOURS, len(pixels)))
+    places = torch.rand(count, 2, generator=generator) * size
+    apart, nearest = nearest_of(places, pixels, min(NEIGHBOURS, len(pixels)))
     gaps = apart[:, 0] > math.sqrt(camera.width * camera.height / len(pixels))
     counted = view.counted()
-    column, row = asked.long().unbind(1)
+    column, row = places.long().unbind(1)
     if counted is not None:
         gaps &= counted[row, column]
     weights = 1 / apart.clamp_min(1)
     log_depth = (weights * depths.log()[nearest]).sum(1) / weights.sum(1)
     colours = (view.image()[:, row, column].T * 255).round().byte()
-    return camera.unproject(asked, log_depth.exp())[gaps], colours[gaps]
+    return camera.unproject(places, log_depth.exp())[gaps], colours[gaps]
 
 
 def in_view(camera: Camera, positions: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M"]]:
-    """Pixel positions and depths of the points that lie in a camera's raster, beyond its near plane."""
+    """Return pixel positions and depths of the points in a camera's raster, beyond its near plane."""
     pixels, depths = camera.project(positions)
     inside = camera.shows(pixels, depths)
     return pixels[inside], depths[inside]
 
 
 def in_front(pixels: Float[Tensor, "M 2"], depths: Float[Tensor, "M"]) -> Bool[Tensor, "M"]:
-    """Points that are not much farther than what is seen beside them."""
+    """Return which points are not hidden: not much farther than their neighbours in the picture."""
     _, nearest = nearest_of(pixels, pixels, min(COVERED, len(pixels)))
     return depths <= BEHIND * depths[nearest].amin(1)
 
@@ -83,7 +79,7 @@ def in_front(pixels: Float[Tensor, "M 2"], depths: Float[Tensor, "M"]) -> Bool[T
 def nearest_of(
     places: Float[Tensor, "P 2"], pixels: Float[Tensor, "M 2"], count: int
 ) -> tuple[Float[Tensor, "P count"], Int[Tensor, "P count"]]:
-    """(distances to the nearest pixels, which those are) of some places, MOST_DISTANCES at a time."""
+    """Return distances and numbers of the pixels nearest to each place."""
     parts = places.split(max(1, MOST_DISTANCES // max(1, len(pixels))))
     found = [torch.cdist(part, pixels).topk(count, largest=False) for part in parts]
     return torch.cat([distances for distances, _ in found]), torch.cat([which for _, which in found])

@@ -11,13 +11,12 @@ from gsx.scenes.pose_files import frames_in, read_frames, read_json, refuse_twic
 
 FILE, TRAIN_FILE = "transforms.json", "transforms_train.json"
 TEST_FILES = ("transforms_test.json", "transforms_val.json")
-TEST_FRAMES = "test_frames"
-"""Key of ScanNet++ for the frames to test on."""
+TEST_FRAMES = "test_frames"  # ScanNet++'s key of the frames to test on
 
 
 @dataclass(frozen=True, eq=False)
 class FrameFile:
-    """Frames of one transforms file that are all trained on, all tested on, or yet to be split."""
+    """Frames of one transforms file: all to train on, all to test on, or to be split."""
 
     file: Path
     content: Mapping[str, Any]
@@ -26,11 +25,7 @@ class FrameFile:
 
 
 def frame_files(path: Path) -> list[FrameFile]:
-    """Return what `path`, a transforms file or its folder, holds: all frames, or those to train and those to test on.
-
-    Raises:
-        InputError: a file is missing or damaged, one image is in both, or they are those of a NeRF-synthetic scene.
-    """
+    """Read a transforms file or folder: all frames, or those to train and to test on; InputError: it is unusable."""
     file = path if path.is_file() else path / FILE
     if not file.is_file() and (path / TRAIN_FILE).is_file():
         parts = _pair(path)
@@ -44,7 +39,7 @@ def frame_files(path: Path) -> list[FrameFile]:
 
 
 def _pair(folder: Path) -> list[FrameFile]:
-    """Return the parts of a folder with transforms_train.json, which states more of its cameras than an angle."""
+    """Read a folder with transforms_train.json, whose cameras have more than an angle of view."""
     content = read_json(folder / TRAIN_FILE)
     frames = content.get("frames")
     listed = [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
@@ -54,13 +49,13 @@ def _pair(folder: Path) -> list[FrameFile]:
 
 
 def test_file(folder: Path) -> Path | None:
-    """Return the file that says what to test on, if it lists any: transforms_test.json, else transforms_val.json."""
+    """Return the file of the test frames: transforms_test.json, else transforms_val.json; None: neither has frames."""
     files = (folder / name for name in TEST_FILES)
     return next((file for file in files if file.is_file() and not is_empty(file)), None)
 
 
 def is_empty(file: Path) -> bool:
-    """Return whether a transforms file lists no frames; False for a damaged one, which is refused when it is read."""
+    """Return whether a transforms file lists no frames; False for a damaged one, which `read_frames` refuses."""
     try:
         return read_json(file).get("frames") == []
     except InputError:
@@ -68,13 +63,13 @@ def is_empty(file: Path) -> bool:
 
 
 def nodes(part: FrameFile) -> Iterator[Mapping[str, Any]]:
-    """Yield what may state a camera: the file's common values, then each frame."""
+    """Yield the mappings that may describe a camera: the file's common values, then each frame."""
     yield part.content
     yield from part.frames
 
 
 def needs_lens(file: Path) -> bool:
-    """Return whether a transforms file states other cameras than its angle of view makes; False for a damaged one."""
+    """Return whether a file's cameras have more than its angle of view; False for a damaged one."""
     try:
         content, frames = read_frames(file)
     except InputError:

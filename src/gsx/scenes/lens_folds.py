@@ -1,9 +1,8 @@
-"""Lenses that fold: where the polynomial of a lens stops growing, pixels show mirrored what others show already.
+"""Lenses that fold: beyond the maximum of a lens's polynomial, pixels mirror what others show already.
 
-`r (1 + k r^2)` with k < 0 grows as far as r = 1 / sqrt(-3 k). Farther rays come back towards the middle, and pixels
-beyond the turning point have no ray at all. A picture that reaches past it is mirrored there. What can be trained on
-is the part around the principal axis in which the lens keeps the orientation of the picture: the Jacobian determinant
-of its map from rays to pixels is positive. This holds for every lens model, so none needs a formula of its own.
+`r (1 + k r^2)` with k < 0 grows up to r = 1 / sqrt(-3 k). Farther rays return towards the middle, pixels beyond the
+turning point have no ray, and a picture that reaches past it is mirrored there. Training uses the part around the
+principal axis in which the Jacobian determinant of the map from rays to pixels is positive, for every lens model.
 """
 
 import math
@@ -17,34 +16,29 @@ from torch.nn.functional import max_pool2d
 from gsx.core.errors import InputError
 from gsx.core.shapes import Bool, Float
 
-STEPS = 129
-"""Places along each side of an undistorted picture at which its orientation is checked."""
-FINE_STEPS = 257
-"""Places along each side where a part has to be cut out: the cut is exact to so many parts of the side."""
-RAY_STEPS = 257  # along each side of a photo, at which it is checked whether pixels have rays
-DIFFERENCE = 1e-6  # of a ray's slope, by which derivatives are taken
-LARGEST_SCALE = 2.0
-"""An undistorted side is at most so many times the photo's, as COLMAP's are (UndistortCameraOptions.max_scale)."""
-LEAST_AREA = 0.01
-"""Least area of the photo that a pixel of a cut picture shows, px for one in its middle: at the fold it is 0."""
+STEPS = 129  # places along each side of an undistorted picture at which its orientation is checked
+FINE_STEPS = 257  # places along each side at which a cut may be
+RAY_STEPS = 257  # places along each side of a photo at which rays are computed
+DIFFERENCE = 1e-6  # step of a ray's slope for derivatives
+LARGEST_SCALE = 2.0  # of an undistorted side by the photo's, as COLMAP's (UndistortCameraOptions.max_scale)
+LEAST_AREA = 0.01  # of the photo in a pixel of a cut picture, by that of its middle: at the fold it is 0
 REACH = 2.0  # px of the photo, along each axis, from which a pixel is interpolated
-LEAST_SHARE = 0.2
-"""Share of a photo that its cut picture shows at least; of less, the lens is wrong."""
+LEAST_SHARE = 0.2  # of a photo in its cut picture: at less, the lens is wrong
 
 
 @dataclass(frozen=True)
 class Cut:
-    """The part of a photo that an undistorted picture shows where its lens folds."""
+    """The part of a photo that is left in its undistorted picture where the lens folds."""
 
     pixels: int
-    """Pixels of the photo that the picture shows."""
+    """Pixels of the photo in the picture."""
     radius: float
-    """Distance in px from the principal point to the nearest pixel without a ray; infinite: each has one."""
+    """Distance from the principal point to the nearest pixel without a ray, px; infinite: none is without."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Rays on a rectangular grid and where a lens puts them."""
+    """Rays on a rectangular grid and their pixels through a lens."""
 
     x: Float[Tensor, "X"]
     """Slopes x/z, increasing."""
@@ -65,17 +59,14 @@ def lattice_of(camera: Any, x: Float[Tensor, "X"], y: Float[Tensor, "Y"]) -> Lat
 
 
 def project(camera: Any, x: Float[Tensor, "X"], y: Float[Tensor, "Y"]) -> Float[Tensor, "Y X 2"]:
-    """Return pixels of the rays of a grid of slopes; not finite where a lens has none."""
+    """Return the pixels of a grid of slopes, not finite where a lens has none."""
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
     rays = torch.stack([grid_x, grid_y, torch.ones_like(grid_x)], dim=-1).reshape(-1, 3)
     return torch.from_numpy(camera.img_from_cam(rays.numpy())).reshape(len(y), len(x), 2)
 
 
 def shows_truly(camera: Any, pinhole: Any) -> bool:
-    """Return whether no pixel of `pinhole` is mirrored, nor one that lies beyond a border of pixels without rays.
-
-    Both are pycolmap cameras.
-    """
+    """Return whether no pixel of `pinhole` is mirrored or beyond the photo; both are pycolmap cameras."""
     x = slopes(0.5, pinhole.width - 0.5, pinhole.principal_point_x, pinhole.focal_length_x, STEPS)
     y = slopes(0.5, pinhole.height - 0.5, pinhole.principal_point_y, pinhole.focal_length_y, STEPS)
     lattice = lattice_of(camera, x, y)
@@ -98,20 +89,18 @@ def inside(camera: Any, pixels: Float[Tensor, "*N 2"], margin: float = 0.0) -> B
 
 def border_rays(camera: Any) -> Float[Tensor, "K 2"]:
     """Return rays of pixel centres along the photo's border; NaN where there is none."""
-    x = torch.linspace(0.5, camera.width - 0.5, STEPS, dtype=torch.float64)
-    y = torch.linspace(0.5, camera.height - 0.5, STEPS, dtype=torch.float64)
-    sides = [torch.stack([x, torch.full_like(x, float(row))], 1) for row in (y[0], y[-1])]
-    sides += [torch.stack([torch.full_like(y, float(column)), y], 1) for column in (x[0], x[-1])]
+    x, y = (torch.linspace(0.5, side - 0.5, STEPS, dtype=torch.float64) for side in (camera.width, camera.height))
+    sides = [torch.cartesian_prod(x, y[[0, -1]]), torch.cartesian_prod(x[[0, -1]], y)]
     return torch.from_numpy(camera.cam_from_img(torch.cat(sides).numpy()))
 
 
 def cut_where_folded(camera: Any, pinhole: Any) -> tuple[Any, Cut]:
-    """Return the largest pinhole camera that shows nothing mirrored and nothing twice, and what it shows of the photo.
+    """Return the largest pinhole camera without mirrored pixels, and the part of the photo in it.
 
-    It has the focal lengths of `pinhole`, what COLMAP would undistort to; all are pycolmap cameras.
+    It has the focal lengths of `pinhole`, to which COLMAP would undistort; all are pycolmap cameras.
 
     Raises:
-        InputError: it would show less than `LEAST_SHARE` of the photo.
+        InputError: it has less than `LEAST_SHARE` of the photo.
     """
     x = around_axis(camera.width, camera.principal_point_x, camera.focal_length_x)
     y = around_axis(camera.height, camera.principal_point_y, camera.focal_length_y)
@@ -127,18 +116,21 @@ def cut_where_folded(camera: Any, pinhole: Any) -> tuple[Any, Cut]:
     pixels = 0 if cut is None else round(float(part.mean()) * area)
     if cut is None or pixels < LEAST_SHARE * camera.width * camera.height:
         raise refusal(camera, pixels)
-    return cut, Cut(min(pixels, camera.width * camera.height), radius_without_rays(camera))
+    columns, rows, lost = pixels_without_rays(camera)
+    distances = torch.hypot(columns - camera.principal_point_x, (rows - camera.principal_point_y)[:, None])
+    radius = float(distances[lost].min()) if bool(lost.any()) else math.inf
+    return cut, Cut(min(pixels, camera.width * camera.height), radius)
 
 
 def usable_rays(camera: Any, lattice: Lattice) -> Bool[Tensor, "Y X"]:
-    """Return which rays of a lattice the photo shows, unmirrored and not too small; false for NaN."""
+    """Return which rays of a lattice are in the photo, unmirrored and not too small; false for NaN."""
     middle = lattice.areas[lattice.y.abs().argmin(), lattice.x.abs().argmin()]
-    shown = inside(camera, lattice.pixels) & (lattice.areas > 0) & (lattice.areas > LEAST_AREA * middle)
-    return shown & surrounded(camera, lattice.pixels.nan_to_num())
+    visible = inside(camera, lattice.pixels) & (lattice.areas > 0) & (lattice.areas > LEAST_AREA * middle)
+    return visible & surrounded(camera, lattice.pixels.nan_to_num())
 
 
 def surrounded(camera: Any, pixels: Float[Tensor, "*N 2"]) -> Bool[Tensor, "*N"]:
-    """Return which positions on a photo are interpolated from pixels for which there is a ray."""
+    """Return which positions on a photo are interpolated from pixels that all have a ray."""
     x, y, lost = pixels_without_rays(camera)
     step_x, step_y = (float(places[1] - places[0]) if len(places) > 1 else 1.0 for places in (x, y))
     reach = [math.ceil(REACH / step) for step in (step_y, step_x)]
@@ -149,7 +141,7 @@ def surrounded(camera: Any, pixels: Float[Tensor, "*N 2"]) -> Bool[Tensor, "*N"]
 
 
 def pixels_without_rays(camera: Any) -> tuple[Float[Tensor, "X"], Float[Tensor, "Y"], Bool[Tensor, "Y X"]]:
-    """Return columns and rows of pixels spread over the photo of a camera, and which of these have no ray."""
+    """Return columns and rows of pixels spread over a camera's photo, and which pixels have no ray."""
     sides = camera.width, camera.height
     x, y = (torch.linspace(0.5, side - 0.5, min(side, RAY_STEPS), dtype=torch.float64) for side in sides)
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
@@ -158,7 +150,7 @@ def pixels_without_rays(camera: Any) -> tuple[Float[Tensor, "X"], Float[Tensor, 
 
 
 def nearest_to_axis(camera: Any, lattice: Lattice, usable: Bool[Tensor, "Y X"]) -> tuple[int, int] | None:
-    """Return (row, column) of the usable ray nearest to the principal axis; None where a fold lies in between."""
+    """Return (row, column) of the usable ray nearest to the principal axis; None: a fold is between them."""
     distances = torch.where(usable, lattice.x.square() + lattice.y.square()[:, None], torch.inf)
     row, column = divmod(int(distances.argmin()), len(lattice.x))
     if not usable[row, column]:
@@ -178,10 +170,10 @@ def around_axis(side: int, principal: float, focal: float) -> Float[Tensor, "N"]
 
 def largest_rectangle(usable: Bool[Tensor, "Y X"], row: int, column: int) -> tuple[int, int, int, int]:
     """Return (top, bottom, left, right), inclusive, of the usable rectangle of the largest area around one place."""
-    # of each column, how many places from the row upwards, and downwards, are usable without a gap
-    up, down = (part.long().cumprod(0).sum(0) for part in (usable[: row + 1].flip(0), usable[row:]))
-    left_up, right_up = (outward(up, column, side) for side in (-1, 1))
-    left_down, right_down = (outward(down, column, side) for side in (-1, 1))
+    # number of places of each column, from the row upwards and downwards, that are usable without a gap
+    reaches = [part.long().cumprod(0).sum(0) for part in (usable[: row + 1].flip(0), usable[row:])]
+    left_up, left_down = (reach[: column + 1].flip(0).cummin(0).values for reach in reaches)  # least of all between
+    right_up, right_down = (reach[column:].cummin(0).values for reach in reaches)
     heights = torch.minimum(left_up[:, None], right_up) + torch.minimum(left_down[:, None], right_down) - 2
     widths = torch.arange(len(left_up))[:, None] + torch.arange(len(right_up))
     areas = torch.where(torch.minimum(left_up[:, None], right_up) > 0, heights * widths, -1)
@@ -190,14 +182,8 @@ def largest_rectangle(usable: Bool[Tensor, "Y X"], row: int, column: int) -> tup
     return row - max(int(above) - 1, 0), row + max(int(below) - 1, 0), column - before, column + after
 
 
-def outward(reach: Tensor, column: int, side: int) -> Tensor:
-    """Return the least reach of all columns from one outwards, to the left (-1) or to the right (1)."""
-    from_column = reach[: column + 1].flip(0) if side < 0 else reach[column:]
-    return from_column.cummin(0).values
-
-
 def with_window(pinhole: Any, left: float, right: float, top: float, bottom: float) -> Any | None:
-    """Return a pycolmap PINHOLE camera of the focal lengths of `pinhole` that sees these slopes; None: no pixel."""
+    """Return the pycolmap PINHOLE camera of these slopes with the focal lengths of `pinhole`; None: no pixel."""
     import pycolmap
 
     fx, fy = pinhole.focal_length_x, pinhole.focal_length_y
@@ -207,15 +193,8 @@ def with_window(pinhole: Any, left: float, right: float, top: float, bottom: flo
     return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[fx, fy, -left * fx, -top * fy])
 
 
-def radius_without_rays(camera: Any) -> float:
-    """Return px from the principal point of a camera to the nearest pixel of its photo for which there is no ray."""
-    x, y, lost = pixels_without_rays(camera)
-    distances = torch.hypot(x - camera.principal_point_x, (y - camera.principal_point_y)[:, None])
-    return float(distances[lost].min()) if bool(lost.any()) else math.inf
-
-
 def refusal(camera: Any, pixels: int) -> InputError:
-    """Return the error for a lens that folds so early that too little of its photo is left."""
+    """Return the error for a lens that leaves too little of its photo."""
     whole = camera.width * camera.height
     return InputError(
         f"The {camera.model_name} camera of a {camera.width}x{camera.height} photo ({camera.params_to_string()}) "

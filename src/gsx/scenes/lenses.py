@@ -1,4 +1,4 @@
-"""The camera of a frame in a transforms file, by the keys of nerfstudio and instant-ngp, as a pycolmap camera."""
+"""Cameras of frames in transforms files (keys of nerfstudio and instant-ngp) as pycolmap cameras."""
 
 import math
 import reprlib
@@ -14,11 +14,10 @@ from gsx.scenes.colmap_records import LARGEST_SIDE
 from gsx.scenes.pose_files import finite_number
 
 BENDING = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
-"""Keys of what lenses do to straight lines; their meaning depends on the camera model."""
-PARAMETERS = "distortion_params"
-"""Key of the list that nerfstudio has in place of these for FISHEYE624 (Project Aria)."""
+"""Keys of distortion; their meaning depends on the camera model."""
+PARAMETERS = "distortion_params"  # nerfstudio's list in place of these for FISHEYE624 (Project Aria)
 FOCAL = {"x": ("x_fov", "fl_x", "camera_angle_x"), "y": ("y_fov", "fl_y", "camera_angle_y")}
-"""Keys of a focal length by axis, first those that win: degrees (instant-ngp), pixels, radians."""
+"""Keys of a focal length by axis, in order of precedence: degrees (instant-ngp), pixels, radians."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +26,9 @@ class Lens:
 
     model: str
     keys: tuple[str, ...] = ()
-    """Distortion in the order of pycolmap's parameters, of which those at the end may be missing and are 0 then."""
+    """Keys of distortion in the order of pycolmap's parameters; further parameters are 0."""
     fisheye: bool = False
-    """It bends the picture even where all distortion is 0."""
+    """It distorts the picture even if all parameters are 0."""
 
 
 OPENCV = Lens("OPENCV", ("k1", "k2", "p1", "p2", "k3"))
@@ -46,7 +45,7 @@ LENSES = {
     "SIMPLE_RADIAL_FISHEYE": Lens("OPENCV_FISHEYE", FISHEYE[:1], fisheye=True),
     "FISHEYE624": Lens("RAD_TAN_THIN_PRISM_FISHEYE", (PARAMETERS,), fisheye=True),
 }
-"""Camera models that are read: nerfstudio's perspective and fisheye ones, and COLMAP's with the same keys."""
+"""Supported camera models: nerfstudio's perspective and fisheye ones, and COLMAP's with the same keys."""
 AROUND = "sees too wide for a pinhole: cut the photos into perspective views, and export those"
 FOREIGN = "is not read from transforms files: undistort the photos, or load their COLMAP model with scene=colmap"
 OTHERS = {
@@ -56,12 +55,12 @@ OTHERS = {
     **dict.fromkeys(("FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "FTHETA"), FOREIGN),
     **dict.fromkeys(("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM"), FOREIGN),
 }
-"""Why the other camera models of nerfstudio, instant-ngp and COLMAP are refused, and what to do."""
+"""Reasons against the other camera models of nerfstudio, instant-ngp and COLMAP, with remedies."""
 MODES = {"equirectangular": "EQUIRECTANGULAR", "latlong": "LATLONG", "ftheta_p0": "FTHETA"}
-"""Keys by which instant-ngp names a lens."""
+"""Keys of instant-ngp that name a lens."""
 
 
-def completed(content: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
+def complete_frame(content: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
     """Return a frame with the file's common values; its own focal length, in any unit, replaces the common one."""
     common = dict(content)
     for keys in FOCAL.values():
@@ -77,13 +76,13 @@ def states_lens(content: Mapping[str, Any]) -> bool:
 
 
 def angle_of(content: Mapping[str, Any]) -> float | None:
-    """Return the horizontal angle of view in radians that a file states as camera_angle_x; None: no such angle."""
+    """Return the horizontal angle of view (camera_angle_x) in radians; None: the file has no valid one."""
     angle = finite_number(content.get("camera_angle_x"))
     return angle if angle is not None and 0 < angle / 2 < math.pi / 2 else None  # its half is what has a tangent
 
 
 def beyond_angle(content: Mapping[str, Any], frame: Mapping[str, Any]) -> list[str]:
-    """Return the keys by which a frame has another camera than the file's camera_angle_x makes, sorted."""
+    """Return the keys, sorted, by which a frame's camera differs from the file's camera_angle_x."""
     angle, node = angle_of(content), {**content, **frame}
     if angle is None:
         return sorted(key for key in (*FOCAL["x"][:2], *BENDING) if node.get(key))
@@ -92,14 +91,9 @@ def beyond_angle(content: Mapping[str, Any], frame: Mapping[str, Any]) -> list[s
     own = {"fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2}
     stated = {key: finite_number(node.get(key)) for key in own}
     other = [key for key, value in stated.items() if value is not None and abs(value - own[key]) > 0.01 * own[key]]
-    return sorted({*other, *(key for key in BENDING if node.get(key)), *_fisheye(node)})
-
-
-def _fisheye(node: Mapping[str, Any]) -> list[str]:
-    """Return the keys that say fisheye, whose distortion may all be 0."""
     named = str(node.get("camera_model")).upper()
-    fisheye = named in OTHERS or (named in LENSES and LENSES[named].fisheye)
-    return [*(["camera_model"] if fisheye else []), *(["is_fisheye"] if node.get("is_fisheye") else [])]
+    other += ["camera_model"] * (named in OTHERS or (named in LENSES and LENSES[named].fisheye))
+    return sorted({*other, *(key for key in (*BENDING, "is_fisheye") if node.get(key))})
 
 
 def lens_of(entry: Mapping[str, Any], photo: Path, place: str) -> Any:
@@ -108,7 +102,7 @@ def lens_of(entry: Mapping[str, Any], photo: Path, place: str) -> Any:
     The size defaults to the photo's, the focal length to that of an angle of view, the principal point to the middle.
 
     Raises:
-        InputError: the camera model is none of `LENSES`, or a value is missing, contradictory or senseless.
+        InputError: the camera model is none of `LENSES`, or a value is missing, contradictory or invalid.
     """
     import pycolmap
 
@@ -130,7 +124,7 @@ def lens_of(entry: Mapping[str, Any], photo: Path, place: str) -> Any:
 
 
 def model_of(entry: Mapping[str, Any], place: str) -> str:
-    """Return the camera model; files of instant-ngp name none and mean OPENCV, or a fisheye by `is_fisheye`."""
+    """Return the name of the camera model; files of instant-ngp name none and mean OPENCV, or fisheye."""
     stated = entry.get("camera_model")
     mode = next((name for key, name in MODES.items() if entry.get(key) is not None and entry[key] is not False), None)
     fisheye = bool(entry.get("is_fisheye"))
@@ -150,21 +144,14 @@ def model_of(entry: Mapping[str, Any], place: str) -> str:
 
 
 def _distortion(entry: Mapping[str, Any], name: str, place: str) -> list[float]:
-    """Return the distortion of a camera model in pycolmap's order.
-
-    Raises:
-        InputError: the entry has distortion that this camera model has not.
-    """
+    """Return the distortion of a camera model in pycolmap's order; InputError: the model lacks a parameter."""
     keys = LENSES[name].keys
     others = {key: _number(entry, key, 0.0, place) for key in BENDING if key not in keys}
     if odd := [key for key, value in others.items() if value]:
-        remedy = (
-            "undistort the photos" if name == "OPENCV" else "set camera_model to the lens that has it, or remove it"
-        )
-        raise InputError(
-            f"{place} is {name} and has distortion {', '.join(odd)}, of which that has {', '.join(keys) or 'none'}: "
-            f"{remedy}."
-        )
+        other = "set camera_model to the lens that has it, or remove it"
+        remedy = "undistort the photos" if name == "OPENCV" else other
+        known = ", ".join(keys) or "none"
+        raise InputError(f"{place} is {name} and has distortion {', '.join(odd)}, of which that has {known}: {remedy}.")
     return _parameters(entry, place) if keys == (PARAMETERS,) else [_number(entry, key, 0.0, place) for key in keys]
 
 
@@ -198,7 +185,7 @@ def _focal(entry: Mapping[str, Any], name: str, width: int, height: int, place: 
 
 
 def _focal_of(entry: Mapping[str, Any], axis: str, side: int, name: str, place: str) -> float:
-    """Return the focal length of one axis in pixels by the first key that states it; NaN where none does."""
+    """Return the focal length of one axis in pixels by its first key that is there; NaN: none is."""
     degrees, pixels, _ = FOCAL[axis]
     key = next((key for key in FOCAL[axis] if entry.get(key) is not None), pixels)
     value = _number(entry, key, math.nan, place)
@@ -213,7 +200,7 @@ def _focal_of(entry: Mapping[str, Any], axis: str, side: int, name: str, place: 
 
 
 def _number(entry: Mapping[str, Any], key: str, default: float, place: str) -> float:
-    """Return a finite number of the file, or `default` where it is missing."""
+    """Return a finite number of the file; `default`: it has none."""
     value = entry.get(key)
     if value is None:
         return default

@@ -1,4 +1,4 @@
-"""Masks of photographs: where loaders look for them, and which photographs have one."""
+"""Masks of photographs: their places, and the photographs that have one."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -18,10 +18,8 @@ from gsx.scenes.photo_names import SUFFIXES
 from gsx.scenes.photo_source import PhotoSource
 from gsx.scenes.undistort import StoredUndistortion
 
-IMAGES = "images"
-"""Folder of the photos, unless a scene says otherwise."""
-FOLDER = "masks"
-"""Beside the folder of the photographs (COLMAP)."""
+IMAGES = "images"  # usual folder of the photos
+FOLDER = "masks"  # next to the folder of the photos (COLMAP)
 
 
 def mask_of(
@@ -33,38 +31,27 @@ def mask_of(
     options: SceneOptions,
     turns: Turns,
 ) -> Mask | None:
-    """Return the mask of a photograph of that name; None: it has none. `expected`: size of its camera's raster, px.
-
-    Raises:
-        InputError: a mask that the scene names is not there, or has another shape than its photograph.
-    """
+    """Return a photograph's mask, if any; `expected`: size of its camera's raster; InputError: it is missing or odd."""
     if options.masks == "none":
         return None
+    reach = 0 if remap is None else INTERPOLATED
     if options.masks == "alpha":
-        return masking(photo, remap, turns, alpha=True) if has_alpha(photo) else None
+        return Mask(path=photo, alpha=True, remap=turns.around(remap), reach=reach) if has_alpha(photo) else None
     if stated is not None and not is_file(stated):
         raise InputError(f"The mask '{stated}' of '{photo}' does not exist: restore it, or set scene.masks=none.")
     files = filter(is_file, candidates(folder_of(options), name))
     path = stated or next((file for file in files if file.resolve() != photo.resolve()), None)
     if path is None:
         return None
-    bent = None if remap is None else replace(remap, photo=path)
-    return masking(path, bent, turns, before=to_stored(path, turns, expected))
-
-
-def masking(
-    path: Path, remap: StoredUndistortion | None, turns: Turns, before: tuple[int, ...] = (), alpha: bool = False
-) -> Mask:
-    """Return the mask in a file as the photograph is turned and undistorted."""
-    reach = 0 if remap is None else INTERPOLATED
-    return Mask(path=path, alpha=alpha, remap=turns.around(remap, before), reach=reach)
+    undistortion = None if remap is None else replace(remap, photo=path)
+    return Mask(path=path, alpha=False, remap=turns.around(undistortion, to_stored(path, turns, expected)), reach=reach)
 
 
 def to_stored(mask: Path, turns: Turns, raster: Size) -> tuple[int, ...]:
-    """Return the orientations that bring a mask to the raster that its photograph's file stores.
+    """Return the orientations that bring a mask to the raster of its photograph's file.
 
-    A mask has no orientation of its own: its shape says whether it was made for the stored photograph, as COLMAP's are,
-    or for the upright one, as a viewer shows it; where it fits both it is the former.
+    A mask states no orientation. By its shape it belongs to the stored photograph, as COLMAP's do, or else to the
+    upright one.
 
     Raises:
         InputError: it has neither shape.
@@ -73,19 +60,17 @@ def to_stored(mask: Path, turns: Turns, raster: Size) -> tuple[int, ...]:
     if not is_reduction(size, stored) and is_reduction(size, oriented_size(stored, turns.exif)):
         return (INVERSES.get(turns.exif, turns.exif),)
     if not is_reduction(size, stored):
-        raise InputError(
-            f"The mask '{mask}' is {size[0]} x {size[1]} and its photo {stored[0]} x {stored[1]}: give it the photo's "
-            "shape, or set scene.masks=none."
-        )
+        sizes = f"{size[0]} x {size[1]} and its photo {stored[0]} x {stored[1]}"
+        raise InputError(f"The mask '{mask}' is {sizes}: give it the photo's shape, or set scene.masks=none.")
     return ()
 
 
 def folder_of(options: SceneOptions) -> Path:
-    """Return the folder of masks: in the scene's folder, or next to it where that may be the photographs' own."""
+    """Return the folder of masks: in the scene's folder, or next to it where that holds photographs itself."""
     path = expand_home(options.path)
-    own, beside = path / FOLDER, path.parent / FOLDER
+    inside, above = path / FOLDER, path.parent / FOLDER
     photographs = options.name == "photos" and not (path / IMAGES).is_dir()
-    return beside if photographs and not own.is_dir() else own
+    return above if photographs and not inside.is_dir() else inside
 
 
 def candidates(folder: Path, name: str) -> list[Path]:
@@ -100,18 +85,14 @@ def candidates(folder: Path, name: str) -> list[Path]:
 
 
 def mask_notes(views: Sequence[View], options: SceneOptions) -> list[str]:
-    """Return how many photographs have a mask, in a note.
-
-    Raises:
-        InputError: there are masks, and none belongs to a photograph.
-    """
+    """Return a note on the number of photographs with a mask; InputError: no mask belongs to a photograph."""
     found, folder = len(masks_of(views)), folder_of(options)
     if found:
         where = "alpha" if options.masks == "alpha" else "masks"
-        return [f"What the {where} of {found} of {len(views)} photographs leave out counts in no loss and no figure."]
+        return [f"Pixels outside the {where} of {found} of {len(views)} photographs count in no loss and no metric."]
     if options.masks == "alpha":
         raise InputError(
-            "scene.masks=alpha, but no photograph has alpha: leave it out, or give files in a folder 'masks'"
+            "scene.masks=alpha, but no photograph has alpha: leave it out, or put files into a folder 'masks'."
         )
     own = folder.parent == expand_home(options.path)
     if options.masks == "auto" and own and folder.is_dir() and any(map(is_file, folder.rglob("*.*"))):
@@ -130,7 +111,7 @@ def masks_of(views: Sequence[View]) -> list[tuple[str, Mask]]:
 
 
 def masks_named(views: Sequence[View]) -> Mapping[str, Any]:
-    """Return the number and a digest of masks for the provenance; nothing without any: such protocols keep their hash.
+    """Return the number and a digest of masks for the provenance, if any: other protocols keep their hash.
 
     Masks that are the alpha of photographs count by name alone.
     """

@@ -1,6 +1,5 @@
-"""Observations of a COLMAP model that no error can be measured by: keypoints without a ray, points behind a camera."""
+"""Unusable observations of a COLMAP model: keypoints without a ray, points behind a camera."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,24 +20,18 @@ class Unmeasured:
     behind: int = 0
     """Observed points behind their camera."""
     blind: tuple[str, ...] = ()
-    """Images of which no keypoint has a ray."""
+    """Images without a keypoint that has a ray."""
 
     def __str__(self) -> str:
         """Return clauses to append to a sentence; an empty string if all observations are measured."""
-        return "".join(f"; {clause}" for clause in self.clauses())
-
-    def clauses(self) -> Iterator[str]:
-        """Yield one clause for each kind."""
-        if self.no_ray:
-            yield f"keypoints for which the lens has no ray, left out: {self.no_ray}"
-        if self.blind:
-            yield f"no keypoint is left of {some_names(self.blind)}"
-        if self.behind:
-            yield f"observed points that lie behind their camera: {self.behind}"
+        no_ray = f"; keypoints for which the lens has no ray, left out: {self.no_ray}" if self.no_ray else ""
+        blind = f"; no keypoint is left of {some_names(self.blind)}" if self.blind else ""
+        behind = f"; observed points that lie behind their camera: {self.behind}" if self.behind else ""
+        return no_ray + blind + behind
 
 
 def straight_keypoints(image: ModelImage, intrinsics: Any) -> Float[Tensor, "K 2"]:
-    """Return the keypoints in px of the pinhole of `intrinsics`, a pycolmap camera; NaN for those without a ray."""
+    """Return keypoints in px of the pinhole of `intrinsics`, a pycolmap camera; NaN for those without a ray."""
     return undistort_points(intrinsics, pinhole_of(intrinsics), image.keypoints)
 
 
@@ -48,14 +41,14 @@ def known(pixels: Float[Tensor, "K 2"]) -> Bool[Tensor, "K"]:
 
 
 def unmeasured(model: Model) -> Unmeasured:
-    """Return how many of the observations of a model cannot be measured; InputError as `pinhole_of`."""
+    """Count the unusable observations of a model; InputError as `pinhole_of`."""
     rays = [known(straight_keypoints(image, model.cameras[image.camera_id])) for image in model.images]
     ahead = [(image.observed @ image.rotation.T + image.translation)[:, 2] > 0 for image in model.images]
     return counted([image.name for image in model.images], rays, [~one for one in ahead])
 
 
 def counted(names: list[str], rays: list[Bool[Tensor, "_"]], behind: list[Bool[Tensor, "_"]]) -> Unmeasured:
-    """Return the counts of images by name: which keypoints have a ray, and which points lie behind the camera."""
+    """Count unusable observations, by image: which keypoints have a ray, and which points lie behind the camera."""
     return Unmeasured(
         no_ray=sum(int((~one).sum()) for one in rays),
         behind=sum(int((one & other).sum()) for one, other in zip(rays, behind, strict=True)),

@@ -24,12 +24,11 @@ class SceneOptions:
     """Fields common to all loaders; each format adds its own."""
 
     name: str
-    """Name of the format, which is also the name of its file in conf/scene."""
+    """Name of the format, and of its file in conf/scene."""
     background: Annotated[list[float], Range(0, 1)]
     """Display RGB in [0, 1] behind the scene; images with alpha are composited over it (3D-GS, dataset_readers.py)."""
     iterations: Steps = without_effect(default=0)
-    """Length of a run on this scene, unless a variant or the top-level `iterations` says otherwise; 0: the backbone's
-    published one."""
+    """Length of a run on this scene, unless a variant or the top-level `iterations` sets it; 0: the backbone's."""
     path: str = without_effect(default="")
     """Folder of the scene."""
     downscale: Annotated[int, Range(1, 1024)] = 1
@@ -45,22 +44,22 @@ class SceneOptions:
     unit: Annotated[float, Range(1e-9, 1e9)] = 1.0
     """Factor of all positions; published constants (near plane 0.2, limits of scales) expect scenes of a few units."""
     fill: Annotated[int, Range(0, 10**8)] = 0
-    """Points that are added where training views show none (gsx.scenes.filling); 0: none."""
+    """Points that are added where training views have none (gsx.scenes.filling)."""
     disturb: Annotated[dict[str, float], Range(0, 64)] = field(
         default_factory=lambda: {"exposure": 0.0, "shade": 0.0, "pose": 0.0, "blur": 0.0, "covered": 0.0, "some": 1.0}
     )
-    """How training photographs are degraded, for research (gsx.experiments.runs.degraded); 0: not."""
+    """Degradation of training photographs, for research (gsx.experiments.runs.degraded); 0: none."""
     cache_gb: Gigabytes = without_effect(default=2.0)
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
     missing: Share = without_effect(default=0.1)
     """Share of the images that may be absent or unreadable; more are refused."""
     masks: str = "auto"
-    """Which pixels of photographs count. auto: what the scene names (`mask_path` of nerfstudio), else files in a folder
-    `masks`; alpha: what is opaque counts, instead of compositing the rest; none: all pixels (gsx.scenes.masked)."""
+    """Pixels of photographs that count. auto: by the scene's masks (`mask_path` of nerfstudio), else files in a folder
+    `masks`; alpha: opaque ones, instead of compositing the rest; none: all pixels (gsx.scenes.masked)."""
     orientation: str = "auto"
     """Use of EXIF's orientation by scene=photos, colmap and transforms (gsx.scenes.orientation). auto: photos and
-    cameras are turned upright from the raster for which cameras are stated: the stored one, or the turned one where
-    only that has their shape; stored: not at all; turned: cameras are stated for turned photos of any shape."""
+    cameras are turned upright from the raster of the cameras: the stored one, or the turned one where only that has
+    their shape; stored: not at all; turned: cameras are those of turned photos, of any shape."""
     split: str = "every:8"
     """every:K | sharp:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST | none: train on all, measure nothing
     (gsx.scenes.splits)."""
@@ -73,6 +72,6 @@ class SceneOptions:
 
 
 def refuse_other(key: str, word: str, words: Sequence[str]) -> None:
-    """Raise ConfigError for a word that is none of an option's values."""
+    """Raise ConfigError for a word that is no value of the option."""
     if word not in words:
         raise ConfigError(f"scene.{key} is '{word}', use one of {', '.join(words)}.{nearest(word, words)}")

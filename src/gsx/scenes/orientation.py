@@ -1,7 +1,7 @@
-"""Pictures, sizes and cameras turned as EXIF's orientations say, and which turns a photo needs.
+"""Pictures, sizes and cameras turned by EXIF's orientations, and the turns that a photo needs.
 
-Programs state cameras for the raster that a file stores, as COLMAP does: photos of one lens have one camera, however
-it was held. Here a photo is undistorted on that raster, and then turned upright together with its camera.
+Programs such as COLMAP define cameras on the stored raster: photos of one lens share a camera in either orientation.
+Here a photo is undistorted on that raster, and then turned upright together with its camera.
 """
 
 from collections.abc import Callable
@@ -19,55 +19,39 @@ from gsx.scenes.exif import orientation_of
 
 Remap = Callable[[UInt8[Tensor, "C H W"]], UInt8[Tensor, "C h w"]]
 ORIENTATIONS: dict[int, tuple[bool, tuple[int, ...]]] = {
-    1: (False, ()),
-    2: (False, (-1,)),
-    3: (False, (-2, -1)),
-    4: (False, (-2,)),
-    5: (True, ()),
-    6: (True, (-1,)),
-    7: (True, (-2, -1)),
-    8: (True, (-2,)),
-}
+    1: (False, ()), 2: (False, (-1,)), 3: (False, (-2, -1)), 4: (False, (-2,)),
+    5: (True, ()), 6: (True, (-1,)), 7: (True, (-2, -1)), 8: (True, (-2,)),
+}  # fmt: skip
 """EXIF 2.3, tag 0x0112: exchange rows and columns?, then which axes to flip, to bring a stored picture upright."""
-INVERSES = {6: 8, 8: 6}
-"""Orientations that undo others; those missing undo themselves."""
-MIRROR = 2
-"""The orientation that exchanges left and right."""
-ON_SIDE = 8
-"""The orientation that lays upright pictures on their side."""
-AFTER_MIRROR = {2: 1, 4: 3, 5: 8, 7: 6}
-"""Turn that brings a picture of these orientations upright once left and right are exchanged."""
-WITHOUT_MIRROR = {2: 1, 4: 3, 5: 6, 7: 8}
-"""Turn after which a picture of these orientations is upright, but mirrored still."""
-
-TURNS = {
-    1: ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    3: ((-1, 0, 0), (0, -1, 0), (0, 0, 1)),
-    6: ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
-    8: ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
-}
-"""Axes of the turned camera in the stored one's, by orientation; no rigid camera sees a mirror image."""
+INVERSES = {6: 8, 8: 6}  # the others undo themselves
+MIRROR = 2  # exchanges left and right
+ON_SIDE = 8  # lays upright pictures on their side
+AFTER_MIRROR = {2: 1, 4: 3, 5: 8, 7: 6}  # turn upright, by orientation, once left and right are exchanged
+WITHOUT_MIRROR = {2: 1, 4: 3, 5: 6, 7: 8}  # turn upright, by orientation, that leaves a picture mirrored
+TURNS = (1, 3, 6, 8)  # orientations without a mirror, which no rigid camera makes
 
 
 def oriented(image: UInt8[Tensor, "C H W"], orientation: int) -> UInt8[Tensor, "C h w"]:
-    """Return a stored picture of this EXIF orientation upright."""
+    """Turn a stored picture of this EXIF orientation upright."""
     exchange, flips = ORIENTATIONS[orientation]
     return (image.transpose(1, 2) if exchange else image).flip(flips).contiguous()
 
 
 def oriented_size(size: Size, orientation: int) -> Size:
-    """Return (width, height) of a picture that `oriented` has turned."""
+    """Return (width, height) of a picture after `oriented`."""
     width, height = size
     return (height, width) if ORIENTATIONS[orientation][0] else size
 
 
 def oriented_camera(camera: Camera, orientation: int) -> Camera:
-    """Return the camera of a picture that `oriented` has turned by one of `TURNS`: rolled about its viewing axis."""
+    """Roll a camera about its viewing axis, as `oriented` turns its picture by one of `TURNS`."""
     if orientation == 1:
         return camera
-    turn = torch.tensor(TURNS[orientation], dtype=camera.rotation.dtype)
+    exchange, flips = ORIENTATIONS[orientation]
+    right, down = (-1 if axis in flips else 1 for axis in (-1, -2))
+    turn = torch.zeros(3, 3, dtype=camera.rotation.dtype)  # axes of the turned camera in the stored one's
+    turn[0, int(exchange)], turn[1, int(not exchange)], turn[2, 2] = right, down, 1
     width, height = oriented_size(camera.size, orientation)
-    exchange = ORIENTATIONS[orientation][0]
     (fx, cx), (fy, cy) = ((camera.fx, camera.cx), (camera.fy, camera.cy))[:: -1 if exchange else 1]
     return replace(
         camera,
@@ -75,8 +59,8 @@ def oriented_camera(camera: Camera, orientation: int) -> Camera:
         translation=turn @ camera.translation,
         fx=fx,
         fy=fy,
-        cx=width - cx if sum(TURNS[orientation][0]) < 0 else cx,
-        cy=height - cy if sum(TURNS[orientation][1]) < 0 else cy,
+        cx=width - cx if right < 0 else cx,
+        cy=height - cy if down < 0 else cy,
         width=width,
         height=height,
     )
@@ -87,20 +71,20 @@ class Turns:
     """Turns of a stored photo to the raster of its camera, and from there upright."""
 
     exif: int = 1
-    """Orientation that the file states; 1 where EXIF is not used."""
+    """Orientation in the file; 1 where EXIF is not used."""
     first: int = 1
-    """Orientation to apply to the stored photo: the result is what its camera sees."""
+    """Orientation that brings the stored photo to its camera's raster."""
     last: int = 1
-    """Turn of that, one of `TURNS`, which brings it upright."""
+    """Turn of that raster upright, one of `TURNS`."""
 
     def stored_size(self, size: Size) -> Size:
         """Return (width, height) of the stored photo of a camera with a raster of `size`."""
         return oriented_size(size, self.first)
 
     def around(self, remap: Remap | None, before: tuple[int, ...] = ()) -> Remap | None:
-        """Return what turns a stored picture, applies `remap` on its camera's raster, and turns the result upright.
+        """Return a remap that turns a stored picture, applies `remap` on its camera's raster, and turns it upright.
 
-        `before`: orientations to apply to a picture beforehand.
+        `before`: orientations to apply beforehand.
         """
         first = tuple(one for one in (*before, self.first) if one != 1)
         return Turned(first, remap, self.last) if first or self.last != 1 else remap
@@ -108,7 +92,7 @@ class Turns:
 
 @dataclass(frozen=True)
 class Turned:
-    """Turn a picture, apply `remap`, turn the result."""
+    """A remap that turns a picture, applies `remap`, and turns the result."""
 
     first: tuple[int, ...]
     remap: Remap | None
@@ -121,7 +105,7 @@ class Turned:
 
 
 TurnsOf = Callable[[Path, Size], Turns]
-"""The turns of a photo by its file and the (width, height) of its camera."""
+"""Turns of a photo by its file and the (width, height) of its camera."""
 
 
 def as_stored(photo: Path, raster: Size) -> Turns:
@@ -130,10 +114,10 @@ def as_stored(photo: Path, raster: Size) -> Turns:
 
 
 def of_model(photo: Path, raster: Size) -> Turns:
-    """Return the turns of a photo whose camera another program states for a raster of this (width, height).
+    """Return the turns of a photo with another program's camera for a raster of this (width, height).
 
-    It is the stored one, unless only the turned one has its shape: some programs turn photos before they use them.
-    Mirrored photos stay mirrored where the camera saw them so.
+    That is the stored raster, unless only the turned one has its shape: some programs turn photos before use. Mirrored
+    photos stay mirrored on the stored raster.
     """
     exif = orientation_of(photo)
     if exif == 1:  # as nearly all: the size need not be read
@@ -145,7 +129,7 @@ def of_model(photo: Path, raster: Size) -> Turns:
 
 
 def of_turned_model(photo: Path, raster: Size) -> Turns:
-    """Return the turns of a photo whose camera is stated for the photo upright, of any shape."""
+    """Return the turns of a photo whose camera is that of the upright photo, of any shape."""
     exif = orientation_of(photo)
     return Turns(exif=exif, first=exif)
 
@@ -153,7 +137,7 @@ def of_turned_model(photo: Path, raster: Size) -> Turns:
 def of_own_model(photo: Path, raster: Size) -> Turns:
     """Return the turns of a photo for structure from motion by gsx.
 
-    That undoes mirrors, and lays photos on their side that a tool has turned while others of their lens are not.
+    They undo mirrors, and lay photos on their side if a tool has turned them but not others of their lens.
     """
     exif, size = orientation_of(photo), image_size(photo)
     if exif == 1 and size != raster and size == oriented_size(raster, ON_SIDE):

@@ -40,8 +40,8 @@ def around_origin(scene: Scene, origin: Origin) -> Scene:
     return replace(
         scene,
         origin=origin,
-        train=[replace(view, camera=moved(view.camera, origin)) for view in scene.train],
-        test=[replace(view, camera=moved(view.camera, origin)) for view in scene.test],
+        train=[replace(view, camera=relative_camera(view.camera, origin)) for view in scene.train],
+        test=[replace(view, camera=relative_camera(view.camera, origin)) for view in scene.test],
         points=points,
         notes=[*scene.notes, *notes_on(scene, origin)],
     )
@@ -52,7 +52,7 @@ def relative(positions: Float[Tensor, "P 3"], origin: Sequence[float]) -> Float[
     return positions.double() - torch.tensor(origin, dtype=torch.float64) if any(origin) else positions
 
 
-def moved(camera: Camera, origin: Sequence[float]) -> Camera:
+def relative_camera(camera: Camera, origin: Sequence[float]) -> Camera:
     """Return the camera in coordinates relative to an origin, float64; without an origin the same object."""
     if not any(origin):
         return camera
@@ -61,7 +61,7 @@ def moved(camera: Camera, origin: Sequence[float]) -> Camera:
 
 
 def notes_on(scene: Scene, origin: Origin) -> list[str]:
-    """Return what a user should know of a scene that is trained around an origin."""
+    """Return notes on a scene that is trained around an origin."""
     positions = scene.points.positions
     grain = rounding_at(torch.tensor([origin]))
     notes = [
@@ -76,7 +76,7 @@ def notes_on(scene: Scene, origin: Origin) -> list[str]:
     return notes
 
 
-def point_looked_at(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
+def focus_of(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
     """Return the point nearest to the optical axes of all cameras, float64."""
     middle = torch.stack([camera.centre.double() for camera in cameras]).mean(0)
     system, right = torch.zeros(3, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)

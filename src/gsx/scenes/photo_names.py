@@ -1,4 +1,4 @@
-"""Photos by the names that files of poses have for them, and what lies there in place of a missing one."""
+"""Photos by their names in files of poses, and likely replacements of missing ones."""
 
 import os
 import re
@@ -11,10 +11,8 @@ from gsx.core.files import is_file
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Suffixes of photos and masks, in the order of the search: NeRF-synthetic means .png where it states none."""
-DRIVE = re.compile(r"^[A-Za-z]:/")
-"""Beginning of absolute names of Windows."""
-MOST_FILES = 100_000
-"""Files of a folder that are compared with a name."""
+DRIVE = re.compile(r"^[A-Za-z]:/")  # beginning of absolute names of Windows
+MOST_FILES = 100_000  # of a folder, that are compared with a name
 
 
 def plain_name(file_path: str) -> str:
@@ -35,9 +33,9 @@ def find_photo(folder: Path, file_path: str) -> Path | None:
 
 
 def likely_photo(folder: Path, file_path: str) -> str:
-    """Return the photo that a missing frame may mean, relative to the folder; empty if there is none.
+    """Return the photo that a missing frame may mean, relative to the folder; empty: none.
 
-    It lies where the end of a longer path leads, or has another suffix or case.
+    It is at the end of a longer path, or has another suffix or case.
     """
     parts = PurePosixPath(DRIVE.sub("/", plain_name(file_path))).parts
     tails = (PurePosixPath(*parts[first:]) for first in range(len(parts)))
@@ -60,7 +58,7 @@ def _same_stem(folder: Path, name: PurePosixPath) -> Iterator[str]:
 
 
 def similar_photo(folder: Path, names: Sequence[str]) -> str:
-    """Return a sentence on a file in `folder` that is called almost like one of `names`; empty: there is none.
+    """Return a sentence on a file in `folder` with almost the name of one of `names`; empty: none.
 
     Similar names differ by case, suffix, Unicode form, folders or the path before them.
     """
@@ -74,14 +72,14 @@ def similar_photo(folder: Path, names: Sequence[str]) -> str:
 
 
 def _difference(name: str, file: str) -> str:
-    """Return the difference of two names in words, with a remedy."""
-    wanted, present = PurePosixPath(name), PurePosixPath(file)
+    """Describe the difference of two names, with a remedy."""
+    stated, present = PurePosixPath(name), PurePosixPath(file)
     if name.startswith("/") or PureWindowsPath(name).drive:
         return "an absolute path: cut the names in images.txt to what follows the folder of the photos"
-    if wanted.parent != present.parent and wanted.name == present.name:
+    if stated.parent != present.parent and stated.name == present.name:
         return "another folder: set scene.images to the folder to which names are relative"
-    if wanted.stem == present.stem and wanted.suffix.lower() != present.suffix.lower():
-        return f"another suffix: {f'convert the photos to {wanted.suffix}' if wanted.suffix else 'rename the photos'}"
+    if stated.stem == present.stem and stated.suffix.lower() != present.suffix.lower():
+        return f"another suffix: {f'convert the photos to {stated.suffix}' if stated.suffix else 'rename the photos'}"
     return f"another {'case' if name.casefold() == file.casefold() else 'name'}: rename the photos"
 
 

@@ -1,4 +1,4 @@
-"""Photographs as the truth of views: decoded, undistorted, reduced when asked for."""
+"""Photographs as the truth of views: decoded, undistorted and reduced on demand."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,9 +29,9 @@ class PhotoSource:
     expected_size: Size | None = None
     """(width, height) that the camera model states for the stored file; None: any."""
     remap: Callable[[UInt8[Tensor, "C H W"]], UInt8[Tensor, "C height width"]] | None = None
-    """Undistortion or a reduction, applied to the decoded file; those that do the same compare equal."""
+    """Undistortion or reduction of the decoded file; equal ones compare equal."""
     mask: Mask | None = None
-    """What of the photograph counts; None: all of it."""
+    """Mask of the photograph; None: all pixels count."""
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """Return the photograph on the raster of `camera`, which is `whole` on any raster, or a crop of that.
@@ -41,22 +41,21 @@ class PhotoSource:
             ValueError: `camera` reaches past the photograph.
         """
         window, width, height = self.window_of(camera)
-        made_by = str(self.path), self.rule, self.remap, width, height  # all that decides the pixels
-        image = self.cache.get(made_by, lambda: self._resized(width, height))
-        return window.cut(image)
+        key = str(self.path), self.rule, self.remap, width, height  # all that decides the pixels
+        return window.cut(self.cache.get(key, lambda: self._resized(width, height)))
 
     def counted(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
         """Return which pixels of `image(camera)` count; None: all. InputError: the mask leaves none, or is damaged."""
         if self.mask is None:
             return None
         window, width, height = self.window_of(camera)
-        mask, made_by = self.mask, (str(self.mask.path), "mask", self.rule, self.remap, width, height)
-        return window.cut(self.cache.get(made_by, lambda: self._counted(mask, width, height)))[0]
+        mask, key = self.mask, (str(self.mask.path), "mask", self.rule, self.remap, width, height)
+        return window.cut(self.cache.get(key, lambda: self._counted(mask, width, height)))[0]
 
     def transparent(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
-        """Return which pixels of `image(camera)` show nothing of the scene, made from transparent ones alone.
+        """Return which pixels of `image(camera)` are made from transparent ones alone, and hold nothing of the scene.
 
-        None: the photograph is opaque, or a mask says that what it leaves out is unknown. Decodes the file anew.
+        None: the photograph is opaque, or has a mask, outside of which nothing is known. Decodes the file anew.
         """
         if self.mask is not None or not has_alpha(self.path):
             return None
@@ -64,7 +63,7 @@ class PhotoSource:
         return window.cut(untouched(self._decoded()[3:] > 0, width, height, self.rule.filter, self.whole.size))[0]
 
     def window_of(self, camera: Camera) -> tuple[Window, int, int]:
-        """Return (the camera's window of the photograph, width and height of that); ValueError: it reaches past."""
+        """Return the camera's window, and width and height of the whole photograph; ValueError: it reaches past."""
         across, down = camera.fx / self.whole.fx, camera.fy / self.whole.fy
         width, height = round(self.whole.width * across), round(self.whole.height * down)
         left = round(self.whole.cx * across - camera.cx)
@@ -74,7 +73,7 @@ class PhotoSource:
         return Window(left=left, top=top, width=camera.width, height=camera.height), width, height
 
     def max_zoom(self, camera: Camera) -> float:
-        """Return how many times finer the photograph is than `camera`, with 1% for rounded sizes."""
+        """Return how many times finer than `camera` the photograph is, with 1% for rounded sizes."""
         return ZOOM_SLACK * self.whole.fx / camera.fx
 
     def _counted(self, mask: Mask, width: int, height: int) -> Bool[Tensor, "1 height width"]:

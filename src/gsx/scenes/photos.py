@@ -3,6 +3,7 @@
 import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,13 +17,13 @@ from gsx.core.ranges import Range
 from gsx.engine.cache import cache_folder, content_key, file_stamp
 from gsx.formats.suffixes import is_sog_folder
 from gsx.scenes import colmap, sfm, sfm_copies
-from gsx.scenes.colmap_model import Model, error_words, read_model
+from gsx.scenes.cached_models import cached_model, holds_whole_model
+from gsx.scenes.colmap_folders import count_images, model_folders, place, unusual_model_folders
+from gsx.scenes.colmap_model import error_words, read_model
 from gsx.scenes.exif import NO_LENS, lens_of, orientation_of
-from gsx.scenes.kept_models import intact, kept_model
 from gsx.scenes.masked import FOLDER, IMAGES
 from gsx.scenes.options import SceneOptions, refuse_other
 from gsx.scenes.orientation import ON_SIDE, as_stored, of_own_model, oriented_size
-from gsx.scenes.passed_models import refuse_passed_over
 from gsx.scenes.pose_files import refuse_partial, some_names
 from gsx.scenes.readable import readable_size
 
@@ -32,7 +33,7 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 """Suffixes that gsx reads; COLMAP gets copies of photos that it reads otherwise (gsx.scenes.sfm_copies)."""
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw")
 FOREIGN = {".heic": "HEIC", ".heif": "HEIC", ".hif": "HEIC", ".avif": "AVIF"} | dict.fromkeys(RAW, "raw")
-"""Kinds of photos by suffix that neither library decodes."""
+"""Kinds of photos that neither library decodes, by suffix."""
 REMEDIES = {
     "HEIC": "which neither OpenImageIO nor COLMAP reads here: convert them, for example by "
     "'magick mogrify -format jpg *.heic', and set the phone to take JPEG",
@@ -44,9 +45,14 @@ MATCHERS = ("auto", "exhaustive", "sequential")
 CAMERA_MODES = ("auto", "single", "per_image")
 MIN_PHOTOS = 2
 METHOD = "sfm/2"  # part of the cache key: raise the number when the reconstruction changes
-RULES = {"auto": of_own_model, "stored": as_stored}
-"""Turns of a photo by the values of `scene.orientation`."""
 COPIES = "copies/1"  # likewise, where photos are converted for COLMAP
+RULES = {"auto": of_own_model, "stored": as_stored}  # turns of a photo by `scene.orientation`
+UNREAD_POSES = {
+    "poses_bounds.npy": "LLFF", "cameras.xml": "Metashape", "cameras.sfm": "Meshroom", "sfm_data.json": "OpenMVG",
+    "reconstruction.json": "OpenSfM", "bundle.out": "Bundler", "*.nvm": "VisualSFM",
+    "corrected_cameras/*.json": "Polycam", "cameras/*.json": "Polycam",
+}  # fmt: skip
+"""Programs whose files of poses gsx does not read, by patterns of these below a folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,26 +60,27 @@ class PhotosOptions(SceneOptions, sfm.SfmOptions):
     """Options of `conf/scene/photos.yaml`."""
 
     max_reprojection_px: Annotated[float, Range(0, 1e6)]
-    """As for scene=colmap."""
+    """As of scene=colmap."""
 
 
 def load(options: PhotosOptions) -> Scene:
-    """Reconstruct a folder of photos, or take the reconstruction from the cache, and load it.
+    """Load photos by their reconstruction, made or read from the cache; ConfigError: an option has no such value.
 
     Raises:
-        ConfigError: an option has no such value.
-        InputError: there are fewer than two photos, more than the share `missing` of them cannot be read, or they
-            cannot be reconstructed.
+        InputError: too few photos can be read, or they cannot be reconstructed.
     """
     refuse_unknown(options)
     path = expand_home(options.path)
     folder, photos = find_photos(path)
     sizes, notes = readable_sizes(folder, photos)
-    notes += passed_over(path, folder)
+    notes += unused_folder(path, folder)
     broken = sorted({*photos} - sizes.keys())
     refuse_partial(broken, len(photos), folder, options.missing, "cannot be read", remedy_of(folder, broken))
     model = read_model(reconstruct(folder, sizes, options, options.orientation))
-    notes += report(model, list(sizes))
+    placed = f"{len(model.images)} of {len(sizes)} photos: {len(model.points)} points"
+    notes.append(f"Reconstructed {placed}, {error_words(model.mean_error)}.")
+    if lost := sorted(sizes.keys() - {image.name for image in model.images}):
+        notes.append(f"Photos that could not be placed are not used ({len(lost)}): {', '.join(lost)}.")
     common = {field.name: getattr(options, field.name) for field in fields(SceneOptions)}
     as_model = colmap.ColmapOptions(**common, images=folder.name, max_reprojection_px=options.max_reprojection_px)
     scene = colmap.build(model, folder, as_model, notes, RULES[options.orientation])
@@ -92,11 +99,7 @@ def refuse_unknown(options: PhotosOptions) -> None:
 
 
 def find_photos(path: Path) -> tuple[Path, list[str]]:
-    """Return the folder with the photos (`path`, else `path`/images) and their sorted names relative to it.
-
-    Raises:
-        InputError: there is no such folder, or it has fewer than two photos.
-    """
+    """Return the folder with photos (`path`, else `path`/images) and their sorted names; InputError: too few."""
     if not path.is_dir():
         raise InputError(f"scene.path '{path}' is no folder: name the folder that holds the photos.")
     if is_sog_folder(path):
@@ -114,30 +117,32 @@ def find_photos(path: Path) -> tuple[Path, list[str]]:
     return folder, names
 
 
-def passed_over(path: Path, folder: Path) -> list[str]:
-    """Return a note where photos are taken from a folder's top, and there are others in its folder of images."""
+def unused_folder(path: Path, folder: Path) -> list[str]:
+    """Return a note if a folder has photos at its top, which are used, and others in `images`."""
     others = len(photos_in(path / IMAGES, "**/*")) if folder == path and (path / IMAGES).is_dir() else 0
     used = f"{others} photos in {IMAGES} are not used, as there are some in {path}"
-    return [f"{used}: set scene.path to the folder that is meant."] if others else []
+    return [f"{used}: set scene.path to the folder to use."] if others else []
 
 
 def photos_in(folder: Path, pattern: str) -> list[str]:
-    """Return sorted names of photos below `folder` that match `pattern`, without masks and what `aside` leaves out."""
+    """Return sorted names of photos below `folder` that match `pattern`, without masks and `foreign_to_user` files."""
     files = (file.relative_to(folder) for file in folder.glob(pattern) if file.suffix.lower() in PHOTO_SUFFIXES)
-    return sorted(file.as_posix() for file in files if file.parts[0] != FOLDER and not any(map(aside, file.parts)))
+    return sorted(
+        file.as_posix() for file in files if file.parts[0] != FOLDER and not any(map(foreign_to_user, file.parts))
+    )
 
 
-def aside(name: str) -> bool:
-    """Return whether a file or folder is none of a user's own: hidden, or thumbnails of a NAS or of macOS."""
+def foreign_to_user(name: str) -> bool:
+    """Recognise a file or folder that a system has made: hidden, or thumbnails of a NAS or of macOS."""
     return name.startswith(".") or name in ("@eaDir", "__MACOSX")
 
 
 def foreign_sentences(folder: Path) -> list[str]:
-    """Return a sentence with the remedy for each kind of photo that lies in a folder and that nothing here reads.
+    """Return a sentence with the remedy for each kind of unreadable photo in a folder.
 
-    A raw file next to a photo of the same name is that photo once more.
+    A raw file next to a photo of the same name is a copy of it, and does not count.
     """
-    files = [file for file in folder.iterdir() if not aside(file.name)]
+    files = [file for file in folder.iterdir() if not foreign_to_user(file.name)]
     stems = {file.stem for file in files if file.suffix.lower() in PHOTO_SUFFIXES}
     alone = [file.suffix.lower() for file in files if not (file.suffix.lower() in RAW and file.stem in stems)]
     counts = Counter(FOREIGN[suffix] for suffix in alone if suffix in FOREIGN)
@@ -145,11 +150,7 @@ def foreign_sentences(folder: Path) -> list[str]:
 
 
 def readable_sizes(folder: Path, photos: Sequence[str]) -> tuple[dict[str, tuple[int, int]], list[str]]:
-    """Return sizes of the photos by name, without those that cannot be read, and notes on what is passed over.
-
-    Raises:
-        InputError: fewer than two photos can be read.
-    """
+    """Return sizes of the readable photos by name, and notes on the others; InputError: fewer than two."""
     sizes = {}
     for name in photos:
         try:
@@ -166,31 +167,35 @@ def readable_sizes(folder: Path, photos: Sequence[str]) -> tuple[dict[str, tuple
 
 
 def remedy_of(folder: Path, broken: Sequence[str]) -> str:
-    """Return what to do about photos that cannot be read, with the reason of the first."""
-    for name in broken[:1]:
-        try:
-            readable_size(folder / name)
-        except InputError as problem:
-            return f"export them again ({str(problem).rstrip('.')})"
+    """Return the remedy for photos that cannot be read, with the reason of the first."""
+    try:
+        if broken:
+            readable_size(folder / broken[0])
+    except InputError as problem:
+        return f"export them again ({str(problem).rstrip('.')})"
     return "export them again"
 
 
 def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions, orientation: str = "auto") -> Path:
-    """Return the folder with the model of these photos, computed once; InputError: no two photos can be placed.
+    """Return the folder of the model of these photos, computed once; InputError: no two photos can be placed."""
+    import pycolmap
 
-    `orientation`: one of `RULES`.
-    """
     first = {name: RULES[orientation](folder / name, size).first for name, size in sizes.items()}
     first |= turned_already(folder, sizes, options.camera_mode) if orientation == "auto" else {}
     rasters = {name: oriented_size(size, first[name]) for name, size in sizes.items()}
     doubtful = sfm_copies.candidates(folder, first)
-    final = cache_folder("sfm", _key(folder, sizes, options, doubtful))
-    if intact(final):
+    stamps = [(name, *file_stamp(folder / name)) for name in sizes]
+    copies = [(COPIES, *doubtful.items())] if doubtful else []
+    key = content_key(METHOD, pycolmap.__version__, stamps, settings(options), *copies)
+    final = cache_folder("sfm", key)
+    if holds_whole_model(final):
         logger.info("sfm: found the reconstruction of these %d photos in %s", len(sizes), final)
         return final
 
     def make(work: Path) -> Any:
-        best = sfm.reconstruct(sfm_copies.prepared(folder, list(sizes), doubtful, work), rasters, options, work)
+        best = sfm.reconstruct(
+            sfm_copies.folder_for_colmap(folder, list(sizes), doubtful, work), rasters, options, work
+        )
         if best is not None and best.num_reg_images() >= MIN_PHOTOS:
             return best
         raise InputError(
@@ -198,14 +203,14 @@ def reconstruct(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions, orienta
             "camera that moves between shots; try scene.matcher=exhaustive or a larger scene.max_feature_size."
         )
 
-    return kept_model(final, make)
+    return cached_model(final, make)
 
 
 def turned_already(folder: Path, sizes: sfm.Sizes, camera_mode: str) -> dict[str, int]:
-    """Return the orientation that lays those portraits on their side that share a camera with landscapes.
+    """Return the orientation that turns portraits back on their side which share a camera with landscapes.
 
-    A tool has turned their pixels: they state no orientation, and a lens and focal length of which there are landscapes
-    of the same sides (camera_mode=auto), or all photos are to share one camera (single).
+    A tool has turned their pixels: they state no orientation, and a lens and focal length of landscapes with the same
+    sides (camera_mode=auto), or all photos share one camera (single).
     """
     wide = {size for size in sizes.values() if size[0] > size[1]}
     tall = [name for name, size in sizes.items() if size[::-1] in wide and orientation_of(folder / name) == 1]
@@ -216,38 +221,19 @@ def turned_already(folder: Path, sizes: sfm.Sizes, camera_mode: str) -> dict[str
     return dict.fromkeys(tall, ON_SIDE) if camera_mode != "per_image" else {}
 
 
-def _key(folder: Path, sizes: sfm.Sizes, options: sfm.SfmOptions, doubtful: Mapping[str, int]) -> str:
-    import pycolmap
-
-    stamps = [(name, *file_stamp(folder / name)) for name in sizes]
-    copies = [(COPIES, *doubtful.items())] if doubtful else []
-    return content_key(METHOD, pycolmap.__version__, stamps, settings(options), *copies)
-
-
 def settings(options: sfm.SfmOptions) -> dict[str, Any]:
-    """Return the options that the reconstruction depends on."""
+    """Return the options that decide the reconstruction."""
     deciding = {field.name for field in fields(sfm.SfmOptions)} - {"num_threads"}
     return {key: value for key, value in asdict(options).items() if key in deciding}
 
 
-def report(model: Model, photos: Sequence[str]) -> list[str]:
-    """Return what became of the photos, in sentences."""
-    lost = sorted(set(photos) - {image.name for image in model.images})
-    placed = (
-        f"Reconstructed {len(model.images)} of {len(photos)} photos: {len(model.points)} points, "
-        f"{error_words(model.mean_error)}."
-    )
-    unused = f"Photos that could not be placed are not used ({len(lost)}): {', '.join(lost)}."
-    return [placed, unused] if lost else [placed]
-
-
 def recognise(path: Path) -> bool:
-    """Return whether there are photographs in a folder, or in its folder `images`."""
+    """Recognise a folder with photographs, or with some in its folder `images`."""
     return path.is_dir() and bool(photos_in(path, "*") or photos_in(path / IMAGES, "**/*"))
 
 
 def facts(path: Path) -> Iterator[str]:
-    """Yield lines on sizes of the photographs, and what is odd about them."""
+    """Yield lines on the photographs: sizes, turns, sharpness, problems."""
     folder, names = find_photos(path)
     sizes, notes = readable_sizes(folder, names)
     for (width, height), count in sorted(Counter(sizes.values()).items()):
@@ -258,11 +244,42 @@ def facts(path: Path) -> Iterator[str]:
     yield from (f"note      {note}" for note in notes)
 
 
+def refuse_existing_poses(path: Path) -> Mapping[str, str]:
+    """Warn of unused poses near a folder of photos; returns no options.
+
+    Raises:
+        InputError: a COLMAP model or a transforms.json lies below the folder.
+    """
+    if found := next(_below(path), None):
+        raise InputError(
+            f"{path} holds photos, and {found}; to reconstruct the photos again: scene=photos scene.path={path}."
+        )
+    for pattern, program in UNREAD_POSES.items():
+        for file in sorted(path.glob(pattern))[:1]:
+            again = "which gsx does not read: photos are reconstructed again"
+            logger.warning("%s holds cameras of %s, %s. Export a COLMAP model to use them.", file, program, again)
+    above, name = path / "..", path.resolve().parent
+    if model_folders(above) or (above / "transforms.json").is_file():
+        logger.warning("%s has poses of photos, which are not used here: gsx %s uses them.", name, name)
+    return {}
+
+
+def _below(path: Path) -> Iterator[str]:
+    """Describe the models and transforms files below a folder."""
+    for folder in unusual_model_folders(path):
+        name, count = place(path, folder), ""
+        with suppress(InputError):
+            count = f" ({count_images(folder)} images)"
+        yield f"a COLMAP model in {name}{count}: train from it by scene=colmap scene.path={path} scene.model={name}"
+    for file in sorted(path.glob("*/transforms*.json")):
+        yield f"poses in {place(path, file)}: train from them by gsx {file.parent}"
+
+
 FORMAT = SceneFormat(
     meaning="photos without poses, which are reconstructed first",
     sign=f"photos ({', '.join(PHOTO_SUFFIXES)})",
     recognise=recognise,
     facts=facts,
-    overrides=refuse_passed_over,
+    overrides=refuse_existing_poses,
     quick=False,
 )

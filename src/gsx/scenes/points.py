@@ -1,4 +1,4 @@
-"""Initial points of scenes that no reconstruction comes with: from a PLY file, or random (3D-GS)."""
+"""Initial points of scenes without a reconstruction: from a PLY file, or random (3D-GS)."""
 
 import logging
 from collections.abc import Mapping
@@ -18,8 +18,7 @@ from gsx.formats.ply import read_ply
 
 logger = logging.getLogger(__name__)
 
-CONSTANT_BAND = ("f_dc_0", "f_dc_1", "f_dc_2")
-"""Properties of splats that hold their colour from all sides."""
+CONSTANT_BAND = ("f_dc_0", "f_dc_1", "f_dc_2")  # view-independent colour of splats
 GREY = 127  # colour of points without one: the published random clouds store this byte
 
 
@@ -31,23 +30,18 @@ def random_points(
 
 
 def grey_points(positions: Float[Tensor, "P 3"]) -> PointCloud:
-    """Return points without a colour of their own."""
+    """Return grey points."""
     return PointCloud(in_single_where_resolved(positions), torch.full((len(positions), 3), GREY, dtype=torch.uint8))
 
 
 def stored_points(folder: Path, name: str) -> tuple[PointCloud, str]:
-    """Return the points of a PLY file, and a note that says so; InputError as `read_points`."""
+    """Return the points of a PLY file and a note; InputError as `read_points`."""
     cloud = read_points(folder / name)
     return cloud, f"Starts from the {len(cloud)} points of {name}."
 
 
 def read_points(path: Path) -> PointCloud:
-    """Return the points of a PLY file: x, y, z and, where present, colours of 8 or 16 bits, or floats in [0, 1] or
-    [0, 255]. Points that are not finite are left out.
-
-    Raises:
-        InputError: the file cannot be read, has no coordinates, or holds no finite point.
-    """
+    """Return the finite points of a PLY file, with colours of 8 or 16 bits, in [0, 1] or [0, 255]; InputError: none."""
     columns = read_ply(path)
     if not {"x", "y", "z"} <= set(columns):
         raise InputError(f"'{path}' has no x, y, z but {', '.join(columns)}, give a point cloud.")
@@ -61,7 +55,7 @@ def read_points(path: Path) -> PointCloud:
 
 
 def colours_in(columns: Mapping[str, np.ndarray]) -> UInt8[Tensor, "P 3"] | None:
-    """Return the display RGB of points by the columns of their file, grey where not finite; None: none can be read."""
+    """Return the display RGB of points by the columns of their file, grey where not finite; None: unreadable."""
     values = colours_among(columns)
     if values is None and set(CONSTANT_BAND) <= columns.keys():  # a splat file
         values = (0.5 + BAND_0 * np.stack([columns[name] for name in CONSTANT_BAND], 1)).clip(0, 1)
@@ -69,7 +63,7 @@ def colours_in(columns: Mapping[str, np.ndarray]) -> UInt8[Tensor, "P 3"] | None
         return None
     full = full_scale_of(values)
     if full is None:
-        logger.warning("colours from %g to %g are of no known unit: points are grey", values.min(), values.max())
+        logger.warning("colours from %g to %g have no known unit: points are grey", values.min(), values.max())
         return None
     if values.dtype == np.uint8:
         return torch.from_numpy(values)

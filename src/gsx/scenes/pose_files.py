@@ -1,4 +1,4 @@
-"""Files of poses as JSON: their frames, matrices and numbers, and which of their photos are on disk."""
+"""Files of poses as JSON: their frames, matrices and numbers, and their photos on disk."""
 
 import math
 from collections import Counter
@@ -16,17 +16,13 @@ from gsx.core.shapes import Float
 from gsx.scenes.duplicates import refuse_file_twice
 from gsx.scenes.photo_names import find_photo, likely_photo, plain_name
 
-NAMED_AT_MOST = 5  # file names spelt out in a note
+NAMED_AT_MOST = 5  # file names in a note
 ROTATION_TOLERANCE = 0.01  # of the axes' lengths: text formats round, but a scaled camera is another camera
 LAST_ROW = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the object that a JSON file holds.
-
-    Raises:
-        InputError: the file is missing or is no JSON object.
-    """
+    """Return the object in a JSON file; InputError: the file is missing or holds none."""
     if not path.is_file():
         raise InputError(f"'{path}' does not exist: scene.path must be the folder that holds it.")
     refuse_lfs_pointer(path)
@@ -40,17 +36,13 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Return the content of a transforms file and its frames, each with a file name; InputError as `frames_in`."""
+    """Return the content of a transforms file, and its frames; InputError as `frames_in`."""
     content = read_json(path)
     return content, frames_in(content, path)
 
 
 def frames_in(content: Mapping[str, Any], path: Path, key: str = "frames") -> list[dict[str, Any]]:
-    """Return the frames that a transforms file lists under a key, each with a file name.
-
-    Raises:
-        InputError: there are none, or one has no name, one that is no text, or that of another.
-    """
+    """Return the frames that a transforms file lists under a key; InputError: none, or names are unusable."""
     frames = content.get(key)
     if not isinstance(frames, list) or not frames:
         raise InputError(f"'{path}' lists no {key}, export it anew.")
@@ -61,20 +53,20 @@ def frames_in(content: Mapping[str, Any], path: Path, key: str = "frames") -> li
     names = [frame["file_path"] for frame in frames]
     for name in (*names, *(frame["mask_path"] for frame in frames if isinstance(frame.get("mask_path"), str))):
         if any(letter == "\0" or "\ud800" <= letter <= "\udfff" for letter in name):  # NUL, or half of a character
-            raise InputError(f"'{path}' names a photo {name!a}, which is no text: rename the photo, and it here.")
+            raise InputError(f"'{path}' names a photo {name!a}, which is no text: rename it there and on disk.")
     refuse_twice(names, path)
     return frames
 
 
 def refuse_twice(names: Sequence[str], path: Path) -> None:
-    """Raise InputError if two names of a poses file are one."""
+    """Raise InputError if a poses file has a name twice."""
     for name, count in Counter(map(plain_name, names)).items():
         if count > 1:
             raise InputError(f"'{path}' has '{name}' twice, perhaps to train on and to test on: remove one.")
 
 
 def finite_number(value: Any) -> float | None:
-    """Return a number of a file; None for what is no number, not finite, or beyond double precision."""
+    """Return a number of a file; None if it is no number, not finite, or beyond double precision."""
     try:
         number = float(value) if isinstance(value, float | int) else math.nan
     except OverflowError:  # an integer of hundreds of digits
@@ -95,18 +87,14 @@ def refuse_partial(
     if share > allowed:
         raise InputError(
             f"{len(missing)} of the {count} images of '{place}' {fault} ({some_names(missing)}): {remedy}, or train on "
-            f"what is there with scene.missing={math.ceil(100 * share) / 100:g} or more."
+            f"the others with scene.missing={math.ceil(100 * share) / 100:g} or more."
         )
 
 
 def present_frames(
     folder: Path, frames: list[dict[str, Any]], file: Path, allowed: float
 ) -> tuple[list[tuple[dict[str, Any], Path]], list[str]]:
-    """Return the frames whose photo is on disk with its path, and a note that names the others.
-
-    Raises:
-        InputError: no photo is there, more than the share `allowed` is not, or one is there under two names.
-    """
+    """Return the frames with a photo on disk, its path, and a note on the others; InputError: too few, or one twice."""
     pairs = [(frame, find_photo(folder, frame["file_path"])) for frame in frames]
     present = [(frame, photo) for frame, photo in pairs if photo is not None]
     missing = [plain_name(frame["file_path"]) for frame, photo in pairs if photo is None]
@@ -122,10 +110,10 @@ def present_frames(
     return present, [note] if missing else []
 
 
-def renaming(folder: Path, missing: Sequence[str], taken: Container[Path]) -> str:
-    """Return what to do about missing photos if one lies there under another name, which no other frame has taken."""
+def renaming(folder: Path, missing: Sequence[str], used: Container[Path]) -> str:
+    """Return the remedy for missing photos if one is there under another name that no other frame uses."""
     pairs = ((name, likely_photo(folder, name)) for name in missing[:NAMED_AT_MOST])
-    right = (pair for pair in pairs if pair[1] and folder / pair[1] not in taken)
+    right = (pair for pair in pairs if pair[1] and folder / pair[1] not in used)
     return next((f"'{there}' is there, correct '{name}' in the file" for name, there in right), "")
 
 
@@ -136,7 +124,7 @@ def pose_from_opengl(matrix: Any, place: str) -> tuple[Float[Tensor, "3 3"], Flo
     rounded are replaced by the nearest exact ones.
 
     Raises:
-        InputError: it is no such matrix, not finite, or no rigid motion; `place` says where it stands.
+        InputError: it is no such matrix, not finite, or no rigid motion; `place` names its frame.
     """
     try:
         world_from_camera = torch.tensor(matrix, dtype=torch.float64)
@@ -154,7 +142,7 @@ def pose_from_opengl(matrix: Any, place: str) -> tuple[Float[Tensor, "3 3"], Flo
 
 
 def frames_line(file: Path) -> str:
-    """Return how many images of a transforms file are there, for `gsx scenes`."""
+    """Return the number of images of a transforms file on disk, for `gsx scenes`."""
     names = [frame["file_path"] for frame in read_frames(file)[1]]
     absent = [name for name in names if find_photo(file.parent, name) is None]
     missing = f", absent: {some_names(absent)}" if absent else ""
@@ -162,6 +150,6 @@ def frames_line(file: Path) -> str:
 
 
 def some_names(names: Sequence[str]) -> str:
-    """Return the first few names, and how many more there are."""
+    """List the first few names, and the number of others."""
     more = len(names) - NAMED_AT_MOST
     return ", ".join(names[:NAMED_AT_MOST]) + (f" and {more} more" if more > 0 else "")

@@ -1,4 +1,4 @@
-"""Photographs with poses as shots, views and scenes: what their loaders share."""
+"""Photographs with poses as shots, views and scenes: the common steps of their loaders."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,12 +26,11 @@ from gsx.scenes.pose_files import some_names
 from gsx.scenes.undistort import StoredUndistortion, camera_of, cut_of, pinhole_of, undistorted_size
 
 MIN_IMAGES = 2  # one photo leaves depth undetermined
-FARTHEST = 1e9
-"""A camera at a larger coordinate is a mistake: single precision could not tell it from its neighbours."""
+FARTHEST = 1e9  # a camera at a larger coordinate is a mistake: single precision cannot separate it from its neighbours
 STRAY = 1e4
-"""A camera so many times as far from the middle of all as the next farthest is a mistake: what one of them sees is a
-speck to the others. A city from the street to the sky spans some 1e2."""
-SAME_PLACE = 1e-3  # units: cameras that are no farther apart, as on a tripod, say nothing of how large a scene is
+"""A camera so many times as far from the middle of all as the next farthest is a mistake: its view is a speck to the
+others. A city from the street to the sky spans some 1e2."""
+SAME_PLACE = 1e-3  # units: cameras no farther apart, as on a tripod, say nothing about the size of a scene
 
 
 # -- shots -------------------------------------------------------------------------------------------------------------
@@ -46,25 +45,21 @@ class Shot:
     whole: Camera
     """Camera of the whole photo, once undistorted, at the photo's own resolution."""
     expected_size: Size
-    """(width, height) that the poses file states for the photo."""
+    """(width, height) of the photo by the poses file."""
     remap: StoredUndistortion | None = None
     mask: Path | None = None
-    """Its mask, where the poses file names one."""
+    """Its mask, if the poses file names one."""
     turns: Turns = Turns()
     """Turns from the stored photo to the raster of `whole`, and from there upright."""
 
     def __post_init__(self) -> None:
         if not (self.whole.rotation.isfinite().all() and self.whole.translation.abs().max() <= FARTHEST):
-            raise InputError(
-                f"The camera of '{self.photo}' is more than {FARTHEST:g} units away, or turned by no number: correct "
-                "or remove its pose."
-            )
+            far = f"is more than {FARTHEST:g} units away, or has a rotation that is not finite"
+            raise InputError(f"The camera of '{self.photo}' {far}: correct or remove its pose.")
         focal, principal = (self.whole.fx, self.whole.fy), (self.whole.cx, self.whole.cy)
         if not (all(0 < f <= FARTHEST for f in focal) and all(abs(c) <= FARTHEST for c in principal)):
-            raise InputError(
-                f"The camera of '{self.photo}' has focal lengths {focal} and principal point {principal} px: correct "
-                "its intrinsics."
-            )
+            stated = f"has focal lengths {focal} and principal point {principal} px"
+            raise InputError(f"The camera of '{self.photo}' {stated}: correct its intrinsics.")
 
 
 def shot_through(
@@ -75,12 +70,12 @@ def shot_through(
     translation: Float[Tensor, "3"],
     turns_of: TurnsOf = of_model,
 ) -> Shot:
-    """Return a photo taken through `intrinsics`, a pycolmap camera, as the pinhole photo that gsx uses.
+    """Return a photo taken by the pycolmap camera `intrinsics` as the pinhole photo that gsx uses.
 
     `turns_of` finds its turns by the file and the raster of `intrinsics` (`gsx.scenes.orientation.RULES`).
 
     Raises:
-        InputError: the photo's size is no uniform reduction of theirs, or that has no pinhole equivalent.
+        InputError: the photo's size is no uniform reduction of the camera's, or that has no pinhole equivalent.
     """
     try:
         pinhole, expected = pinhole_of(intrinsics), (intrinsics.width, intrinsics.height)
@@ -101,7 +96,7 @@ def shot_through(
 
 
 def shot_notes(shots: Sequence[Shot]) -> list[str]:
-    """Return notes on photos that are undistorted, turned upright, or stay mirrored."""
+    """Return notes on photos that are undistorted, turned upright or mirrored."""
     turned = [shot for shot in shots if shot.turns.exif != 1]
     laid = [shot for shot in shots if shot.turns.exif == 1 and shot.turns.first != 1]
     mirrored = [shot.name for shot in shots if shot.turns.exif in AFTER_MIRROR and shot.turns.first == 1]
@@ -109,11 +104,11 @@ def shot_notes(shots: Sequence[Shot]) -> list[str]:
     if turned:
         notes.append(f"EXIF turns {len(turned)} of {len(shots)} photos upright (scene.orientation).")
     if laid:
-        notes.append(f"{len(laid)} photos that a tool has turned share the camera of those of their lens that are not.")
+        notes.append(f"{len(laid)} photos that a tool has turned share the camera of the others of their lens.")
     if mirrored:
         notes.append(
-            f"EXIF mirrors {len(mirrored)} photos, but the cameras are stated for them as stored: they stay mirrored "
-            f"({some_names(mirrored)})."
+            f"EXIF mirrors {len(mirrored)} photos, but their cameras are those of the stored photos: they stay "
+            f"mirrored ({some_names(mirrored)})."
         )
     return notes
 
@@ -132,26 +127,20 @@ def lens_notes(shots: Sequence[Shot]) -> list[str]:
 
 
 def cut_note(intrinsics: Any) -> str:
-    """Return what is cut off the photos of a pycolmap camera whose lens folds, as the end of a sentence."""
+    """Describe the cut of photos of a pycolmap camera whose lens folds, as the end of a sentence."""
     cut = cut_of(intrinsics)
     if cut is None:
         return ""
     ends = f", {cut.radius:.0f} px from the principal point" if math.isfinite(cut.radius) else ""
-    return (
-        f", cut to where the lens does not fold: it ends within the photo{ends}, and of its "
-        f"{intrinsics.width * intrinsics.height} px {cut.pixels} are used"
-    )
+    pixels = f"of its {intrinsics.width * intrinsics.height} px {cut.pixels} are used"
+    return f", cut to where the lens does not fold: it ends within the photo{ends}, and {pixels}"
 
 
 # -- views and scenes --------------------------------------------------------------------------------------------------
 
 
 def views_of(shots: Sequence[Shot], options: SceneOptions) -> list[View]:
-    """Return views at training size, in the order of `shots`, sharing one image cache.
-
-    Raises:
-        InputError: a mask that the scene names is not there, or a camera is far off all others.
-    """
+    """Return views at training size with a common image cache; InputError: a mask is missing, or a camera far off."""
     refuse_stray(shots)
     red, green, blue = options.background
     rule = ResizeRule(filter=options.resize_filter, light=options.resize_light, background=(red, green, blue))
@@ -160,7 +149,7 @@ def views_of(shots: Sequence[Shot], options: SceneOptions) -> list[View]:
 
 
 def refuse_stray(shots: Sequence[Shot]) -> None:
-    """Raise InputError for a camera that is more than `STRAY` times as far from the middle of all as any other."""
+    """Raise InputError for a camera more than `STRAY` times as far from the middle of all as any other."""
     centres = torch.stack([shot.whole.centre.double() for shot in shots])
     distances, order = (centres - centres.median(dim=0).values).norm(dim=1).sort()
     if len(shots) < 3 or not distances[-1] > STRAY * distances[-2] > STRAY * SAME_PLACE:
@@ -175,7 +164,9 @@ def _view(shot: Shot, options: SceneOptions, rule: ResizeRule, cache: ImageCache
     whole, turns = shot.whole, shot.turns
     if options.principal_point == "centred":  # as 3D-GS assumes (dataset_readers.py)
         whole = replace(whole, cx=whole.width / 2, cy=whole.height / 2)
-    size = training_size(*whole.size, options.downscale, options.max_width)  # of one lens alike, however it was held
+    size = training_size(
+        *whole.size, options.downscale, options.max_width
+    )  # the same for one lens in either orientation
     source = PhotoSource(
         path=shot.photo,
         rule=rule,
@@ -192,10 +183,8 @@ def check_sides(sides: tuple[Sequence[View], Sequence[View]], place: Path) -> No
     """Raise InputError if there are too few training images, or a test image is trained on."""
     train, test = sides
     if len(train) < MIN_IMAGES:
-        raise InputError(
-            f"'{place}' leaves {len(train)} image to train on, but training needs at least {MIN_IMAGES} images: add"
-            " some, or hold out fewer with scene.split."
-        )
+        needed = f"but training needs at least {MIN_IMAGES} images: add some, or hold out fewer with scene.split"
+        raise InputError(f"'{place}' leaves {len(train)} image to train on, {needed}.")
     refuse_shared(train, test, place)
 
 
@@ -208,9 +197,9 @@ def scene_of(
     notes: Sequence[str],
     details: Mapping[str, Any],
 ) -> Scene:
-    """Return the scene in a folder.
+    """Return the scene in a folder; `views`: all that were read; `sides`: those to train and to test on.
 
-    views: all that were read, of which the provenance tells, with the details; sides: those to train and to test on.
+    The provenance describes all views, and holds the details.
     """
     train, test = sides
     return Scene(
@@ -227,9 +216,9 @@ def scene_of(
 
 
 def provenance(options: SceneOptions, views: Sequence[View]) -> dict[str, Any]:
-    """Return what an evaluation has to say about its images, for `Scene.provenance`.
+    """Describe the images of an evaluation, for `Scene.provenance`.
 
-    Without masks and turned photos nothing is said of them: such protocols keep their hash.
+    Masks and turned photos are left out if there are none: such protocols keep their hash.
     """
     sources = [view.source for view in views if isinstance(view.source, PhotoSource)]
     turned = sum(isinstance(source.remap, Turned) for source in sources)

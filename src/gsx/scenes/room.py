@@ -1,7 +1,7 @@
 """The built-in room: plain plaster, thin legs, a few things with pattern; cameras that walk around in it.
 
-What photographs of rooms are like: structure from motion finds points where there is pattern, and nothing on the walls.
-Solids, textures and light are those of the built-in garden; sunlight comes in from above, where no ceiling is.
+As in photographs of rooms, structure from motion finds points where there is pattern, and none on the walls. Solids,
+textures and light are those of the built-in garden; sunlight comes in from above, as there is no ceiling.
 """
 
 import math
@@ -17,11 +17,11 @@ from gsx.core.data.scene import PointCloud, Scene
 from gsx.core.shapes import Float
 from gsx.scenes.demo import textures
 from gsx.scenes.demo.noise import blend
-from gsx.scenes.demo.solids import Solid, box, cylinder, double, sphere
-from gsx.scenes.demo.still_life import SEED, StillLife, Texture, arranged
+from gsx.scenes.demo.solids import box, cylinder, double, sphere
+from gsx.scenes.demo.still_life import SEED, StillLife, Thing, arrange
 from gsx.scenes.demo.textures import Kit, between, edge_distance, make_kit, parity, plain, rgb, smoothstep
-from gsx.scenes.demo.tracing import colours_of, seen_at
-from gsx.scenes.demo.views import DemoOptions, check, photographed, random_places
+from gsx.scenes.demo.tracing import colours_of, points_at
+from gsx.scenes.demo.views import DemoOptions, check, random_places, scene_along
 
 HALF = (2.5, 2.0)  # of the floor, scene units: about metres
 HEIGHT, THICK = 2.4, 0.1  # of the walls
@@ -32,12 +32,12 @@ CHART = (0.52, 0.35)  # half sizes of the picture on the wall
 PLASTER = (0.87, 0.85, 0.81)
 BOARD = 0.16  # width of a floor board
 CONTRAST = 0.04  # of display values between neighbouring pixels: where structure from motion finds points
-TRIES = 5  # rays for each point that is wanted
+TRIES = 5  # rays for each point
 VERSION = "7491cb90a50661ce"  # of the pictures, in protocols and the cache: give another where a pixel changes
 
 
 def boards(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """Floor boards with ends that do not meet, little contrast."""
+    """Draw floor boards with ends that do not meet, little contrast."""
     row = (p[1] / BOARD).floor()
     along = p[0] / 1.3 + 0.5 * parity(row)
     tone = 0.5 + 0.5 * kit.noise.at(along.floor() + 9.0, row + 30.0)
@@ -47,66 +47,65 @@ def boards(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit)
     return blend(rgb((0.30, 0.23, 0.16)), wood, smoothstep(joint / 0.004))
 
 
-def walls() -> list[tuple[Solid, Texture, float]]:
-    """Floor and four walls."""
+def walls() -> list[Thing]:
+    """Return floor and four walls."""
     (x, y), z = HALF, HEIGHT / 2
     plaster = partial(plain, colour=PLASTER)
     return [
-        (box("floor", (0.0, 0.0, 0.01), (2 * x, 2 * y, 0.02)), boards, 0.0),
-        (box("north", (0.0, y + THICK / 2, z), (2 * x + 2 * THICK, THICK, HEIGHT)), plaster, 0.0),
-        (box("south", (0.0, -y - THICK / 2, z), (2 * x + 2 * THICK, THICK, HEIGHT)), plaster, 0.0),
-        (box("east", (x + THICK / 2, 0.0, z), (THICK, 2 * y, HEIGHT)), plaster, 0.0),
-        (box("west", (-x - THICK / 2, 0.0, z), (THICK, 2 * y, HEIGHT)), plaster, 0.0),
+        Thing(box("floor", (0.0, 0.0, 0.01), (2 * x, 2 * y, 0.02)), boards),
+        Thing(box("north", (0.0, y + THICK / 2, z), (2 * x + 2 * THICK, THICK, HEIGHT)), plaster),
+        Thing(box("south", (0.0, -y - THICK / 2, z), (2 * x + 2 * THICK, THICK, HEIGHT)), plaster),
+        Thing(box("east", (x + THICK / 2, 0.0, z), (THICK, 2 * y, HEIGHT)), plaster),
+        Thing(box("west", (-x - THICK / 2, 0.0, z), (THICK, 2 * y, HEIGHT)), plaster),
     ]
 
 
 def on_legs(
     name: str, centre: tuple[float, float], size: tuple[float, float], height: float, leg: float
-) -> list[tuple[Solid, Texture, float]]:
-    """A table top or a seat on four thin legs."""
+) -> list[Thing]:
+    """Return a table top or a seat on four thin legs."""
     (x, y), (width, depth) = centre, size
-    top = box(f"{name} top", (x, y, height - 0.02), (width, depth, 0.04))
+    top = Thing(box(f"{name} top", (x, y, height - 0.02), (width, depth, 0.04)), textures.post)
     corners = [(x + i * (width / 2 - 0.05), y + j * (depth / 2 - 0.05)) for i in (-1, 1) for j in (-1, 1)]
     legs = [cylinder(f"{name} leg", (*corner, (height - 0.04) / 2), leg, height - 0.04) for corner in corners]
-    return [(top, textures.post, 0.0), *((one, textures.bark, 0.0) for one in legs)]
+    return [top, *(Thing(one, textures.bark) for one in legs)]
 
 
-def furniture() -> list[tuple[Solid, Texture, float]]:
-    """Everything in the room with its texture and highlight."""
+def furniture() -> list[Thing]:
+    """Return everything in the room."""
     x, y = HALF
+    picture = box("picture", (0.3, y - 0.02, 1.45), (2 * CHART[0], 0.04, 2 * CHART[1]))
     return [
         *walls(),
-        (
-            box("picture", (0.3, y - 0.02, 1.45), (2 * CHART[0], 0.04, 2 * CHART[1])),
-            partial(textures.sign, half=CHART),
-            0.0,
-        ),
-        (box("chimney", (-x + 0.15, -0.9, 0.65), (0.30, 0.9, 1.3)), textures.bricks, 0.0),
+        Thing(picture, partial(textures.sign, half=CHART)),
+        Thing(box("chimney", (-x + 0.15, -0.9, 0.65), (0.30, 0.9, 1.3)), textures.bricks),
         *on_legs("table", (0.35, 0.15), (1.2, 0.7), 0.74, 0.02),
         *on_legs("chair", (-0.75, 0.75), (0.42, 0.42), 0.46, 0.014),
-        (box("back", (-0.75, 0.95, 0.78), (0.42, 0.03, 0.24)), textures.post, 0.0),
-        (cylinder("tin", (0.1, 0.2, 0.74 + 0.13), 0.11, 0.26, -75.0), partial(textures.tin, radius=0.11), 0.0),
-        (sphere("marble", (0.62, 0.05, 0.74 + 0.12), 0.12), textures.marble, 0.0),
-        (box("crate", (1.9, -1.35, 0.26), (0.52, 0.52, 0.52), 12.0), partial(textures.crate, half=0.26), 0.0),
-        (sphere("ball", (-1.2, -0.5, 0.23), 0.23, 20.0), textures.beach_ball, 0.35),
-        (cylinder("pot", (2.0, 1.5, 0.2), 0.25, 0.40), partial(textures.pot, half_height=0.2), 0.0),
-        (cylinder("trunk", (2.0, 1.5, 0.6), 0.045, 0.46), textures.bark, 0.0),
-        (sphere("crown", (2.0, 1.5, 1.12), 0.40), textures.foliage, 0.0),
-        (cylinder("lamp", (-1.9, 1.5, 0.75), 0.012, 1.5), textures.bark, 0.0),
-        (sphere("shade", (-1.9, 1.5, 1.55), 0.16), textures.coping, 0.0),
+        Thing(box("back", (-0.75, 0.95, 0.78), (0.42, 0.03, 0.24)), textures.post),
+        Thing(cylinder("tin", (0.1, 0.2, 0.74 + 0.13), 0.11, 0.26, -75.0), partial(textures.tin, radius=0.11)),
+        Thing(sphere("marble", (0.62, 0.05, 0.74 + 0.12), 0.12), textures.marble),
+        Thing(box("crate", (1.9, -1.35, 0.26), (0.52, 0.52, 0.52), 12.0), partial(textures.crate, half=0.26)),
+        Thing(sphere("ball", (-1.2, -0.5, 0.23), 0.23, 20.0), textures.beach_ball, 0.35),
+        Thing(cylinder("pot", (2.0, 1.5, 0.2), 0.25, 0.40), partial(textures.pot, half_height=0.2)),
+        Thing(cylinder("trunk", (2.0, 1.5, 0.6), 0.045, 0.46), textures.bark),
+        Thing(sphere("crown", (2.0, 1.5, 1.12), 0.40), textures.foliage),
+        Thing(cylinder("lamp", (-1.9, 1.5, 0.75), 0.012, 1.5), textures.bark),
+        Thing(sphere("shade", (-1.9, 1.5, 1.55), 0.16), textures.coping),
     ]
 
 
 def make_room() -> StillLife:
-    """The room with its tables, raised above the garden's ground, which darkens what is near."""
+    """Arrange the room above the garden's ground, which darkens near things."""
     up = double((0.0, 0.0, FLOOR))
-    lifted = [(replace(one, centre=one.centre + up), texture, shine) for one, texture, shine in furniture()]
-    return arranged(lifted, make_kit(torch.Generator().manual_seed(SEED)))
+    lifted = [replace(one, solid=replace(one.solid, centre=one.solid.centre + up)) for one in furniture()]
+    return arrange(lifted, make_kit(torch.Generator().manual_seed(SEED)))
 
 
 def walking_camera(place: float, width: int, height: int) -> Camera:
-    """The camera at `place` in [0, 1) of a walk around the table, at changing heights; it looks across the room, in the
-    second round to the walls nearby."""
+    """Return the camera at `place` in [0, 1) of a walk around the table, at changing heights.
+
+    It looks across the room, in the second round at the walls nearby.
+    """
     turn = 2 * math.pi * ROUNDS * place
     outward = 1 <= ROUNDS * place < 2
     eye = (1.55 * math.cos(turn) - 0.1, 1.2 * math.sin(turn) - 0.1, FLOOR + 1.3 + 0.25 * math.sin(2.7 * turn))
@@ -117,18 +116,18 @@ def walking_camera(place: float, width: int, height: int) -> Camera:
 
 
 def found_points(room: StillLife, cameras: Sequence[Camera], count: int, generator: torch.Generator) -> PointCloud:
-    """Points where pictures have pattern, at most so many: as structure from motion would leave them."""
+    """Return points where pictures have pattern, as structure from motion finds them; `count` at most."""
     share = math.ceil(TRIES * count / len(cameras))
     places = [random_places(camera, share, generator) for camera in cameras]
-    seen, *beside = (seen_at(room, cameras, places, shift) for shift in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
-    colours, *near = (colours_of(room, one) for one in (seen, *beside))
-    pattern = torch.maximum(*((other - colours).abs().amax(0) for other in near)) > CONTRAST
-    where, what = seen.points[:, pattern].T, colours[:, pattern].T
-    chosen = torch.randperm(len(where), generator=generator)[:count]
-    return PointCloud(where[chosen].contiguous(), (what[chosen] * 255.0 + 0.5).to(torch.uint8))
+    hits = [points_at(room, cameras, places, shift) for shift in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))]
+    colours, right, below = (colours_of(room, one) for one in hits)
+    pattern = torch.maximum((right - colours).abs().amax(0), (below - colours).abs().amax(0)) > CONTRAST
+    positions, colours = hits[0].points[:, pattern].T, colours[:, pattern].T
+    chosen = torch.randperm(len(positions), generator=generator)[:count]
+    return PointCloud(positions[chosen].contiguous(), (colours[chosen] * 255.0 + 0.5).to(torch.uint8))
 
 
 def load(options: DemoOptions) -> Scene:
-    """Return the room; its pictures are rendered when first asked for. ConfigError: see `check`."""
+    """Return the room, whose pictures are rendered at first use; ConfigError: see `check`."""
     check(options)
-    return photographed(options, make_room(), walking_camera, found_points, "room", VERSION, "a walk", floor=FLOOR)
+    return scene_along(options, make_room(), walking_camera, found_points, "room", VERSION, "a walk", floor=FLOOR)

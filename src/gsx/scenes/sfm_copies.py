@@ -1,7 +1,7 @@
-"""Copies of photos that COLMAP would read otherwise than gsx does, for structure from motion.
+"""Copies of photos that COLMAP decodes differently from gsx, for structure from motion.
 
-COLMAP's wheel decodes no WebP, takes some compressions of TIFF for black pictures, and floating-point pictures as they
-are stored. Mirrored photos (EXIF) match none of the others and have no rigid camera: their copies are not mirrored.
+COLMAP's wheel decodes no WebP, reads some compressions of TIFF as black pictures, and floating-point pictures as
+stored. Mirrored photos (EXIF) match none of the others and have no rigid camera: their copies are not mirrored.
 """
 
 import logging
@@ -20,32 +20,29 @@ logger = logging.getLogger(__name__)
 
 SAME = ("jpeg", "png", "bmp")
 """Formats, by OpenImageIO's names, that both decode to the same pixels (a test compares them)."""
-TOLERANCE = 2.0
-"""Mean difference of 8-bit values up to which a decoded photo is the same: JPEG decoders round differently."""
-WORKERS = 4
-"""Photos that are decoded at once: each takes several times its size of memory."""
+TOLERANCE = 2.0  # mean difference of 8-bit values of equal photos: JPEG decoders round differently
+WORKERS = 4  # photos decoded at once: each takes several times its size of memory
 KEPT = ("Make", "Model", "Exif:FocalLength", "Exif:FocalLengthIn35mmFilm")
 """EXIF from which COLMAP derives focal lengths and shared cameras."""
 
 
 def candidates(folder: Path, first: Mapping[str, int]) -> dict[str, int]:
-    """Return the photos that may need a copy, with the orientation to apply to it, by their headers.
+    """Return the photos that may need a copy, by their headers, with the orientation to apply to it.
 
     `first`: the orientation that brings each stored photo into the raster of its camera.
     """
-    return {name: turn for name, turn in first.items() if turn != 1 or format_of(folder / name) not in SAME}
+
+    def alike(name: str) -> bool:
+        reader = open_image(folder / name)
+        kind = reader.format_name()  # by content
+        reader.close()
+        return kind in SAME
+
+    return {name: turn for name, turn in first.items() if turn != 1 or not alike(name)}
 
 
-def format_of(photo: Path) -> str:
-    """Return OpenImageIO's name of a file's format, by its content."""
-    reader = open_image(photo)
-    name = str(reader.format_name())
-    reader.close()
-    return name
-
-
-def prepared(folder: Path, names: Sequence[str], doubtful: Mapping[str, int], work: Path) -> Path:
-    """Return the folder for COLMAP: `folder`, or one below `work` with links to its photos and with copies of some.
+def folder_for_colmap(folder: Path, names: Sequence[str], doubtful: Mapping[str, int], work: Path) -> Path:
+    """Return the folder for COLMAP: `folder`, or one below `work` with links to its photos and copies of some.
 
     Copies keep the names of their photos, with any suffix: COLMAP recognises formats by content.
 
@@ -66,7 +63,7 @@ def prepared(folder: Path, names: Sequence[str], doubtful: Mapping[str, int], wo
 
 
 def reads_alike(photo: Path) -> bool:
-    """Return whether COLMAP decodes a photo to the colours that gsx trains on."""
+    """Return whether COLMAP decodes a photo to the same colours as gsx."""
     import pycolmap
 
     bitmap = pycolmap.Bitmap.read(photo, True)
@@ -77,7 +74,7 @@ def reads_alike(photo: Path) -> bool:
 
 
 def link(photo: Path, place: Path) -> None:
-    """Make a file available at another place, as a link where the system allows one."""
+    """Link a file to another place, or copy it where the system allows no links."""
     place.parent.mkdir(parents=True, exist_ok=True)
     try:
         place.symlink_to(photo.resolve())
@@ -86,9 +83,9 @@ def link(photo: Path, place: Path) -> None:
 
 
 def copy(photo: Path, place: Path, orientation: int) -> None:
-    """Write the colours of a photo as PNG of 8 bits, turned by an EXIF orientation, with its lens's EXIF."""
+    """Write a photo's colours as PNG of 8 bits, turned by an EXIF orientation, with its lens's EXIF."""
     place.parent.mkdir(parents=True, exist_ok=True)
-    written = place.with_name(f".{place.name}.png")  # hidden files are no photos: it replaces none
+    written = place.with_name(f".{place.name}.png")  # hidden files are no photos
     header = header_of(photo)
     lens = {name: value for name in KEPT if (value := header.getattribute(name)) is not None}
     write_image(written, oriented(read_image(photo)[:3], orientation), lens)

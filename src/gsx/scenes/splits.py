@@ -1,31 +1,34 @@
-"""Which images are held out for testing, decided by their sorted names (3D-GS, camera_utils.py), or by sharpness."""
+"""Choice of held-out images by their sorted names (3D-GS, camera_utils.py), or by sharpness."""
 
+import codecs
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from gsx.core.errors import ConfigError, InputError, nearest
 from gsx.core.quality.sharpness import sharpness
-from gsx.scenes.text_files import read_text
 
 RULES = ("every:K", "sharp:K", "none", "files:train.txt,test.txt", "counts:N_TRAIN,N_TEST")
 DIGITS = 9  # of numbers of images
-SHOWN = 200  # letters of a rule in an error
+LETTERS = 200  # of a rule in an error
 Split = tuple[list[int], list[int]]
-"""Positions of the training and of the test names in the list that was split, each in sorted order."""
+"""Positions of the training and of the test names in the list, each in sorted order."""
+MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32"}
+MARKS |= {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+"""Encodings by byte order mark, longer marks first: that of UTF-32 begins with that of UTF-16."""
 
 
 def split_names(names: list[str], rule: str, folder: Path = Path(), photographs: Sequence[Path] = ()) -> Split:
-    """Split `names` after sorting them; photographs: their files, in the same order, for rules that look at them.
+    """Split `names` after sorting them; `photographs`: their files, in the same order, for `sharp`.
 
     `every:K`: of the sorted names, those at positions 0, K, 2K, ... are test, as published for K = 8.
-    `sharp:K`: of every K of them the one that is the sharpest beside its neighbours.
+    `sharp:K`: of every K of them the one that is sharpest compared with its neighbours is test.
     `none`: all are train.
     `counts:N,M`: M test names spread evenly over the sorted list, then N train names over the rest.
     `files:a,b`: train and test names one per line, with or without suffix; relative files lie in `folder`.
 
     Raises:
-        ConfigError: the rule cannot be read, or looks at photographs where there are none.
-        InputError: a split file or a photograph is unusable, or the rule leaves none to train on or none to test on.
+        ConfigError: the rule cannot be read, or needs photographs that are not there.
+        InputError: a split file or a photograph is unusable, or the rule leaves no training or no test image.
     """
     kind, values = parse_rule(rule)
     order = sorted(range(len(names)), key=lambda i: sort_key(names[i]))
@@ -61,25 +64,25 @@ def parse_rule(rule: str) -> tuple[str, list[int]]:
 
 
 def positive(text: str) -> int | None:
-    """Return a whole number above 0; None for anything else, and for more digits than images have."""
+    """Return a whole number above 0 of up to `DIGITS` digits; None for anything else."""
     word = text.strip()
     return int(word) if word.isdecimal() and len(word) <= DIGITS and int(word) > 0 else None
 
 
 def short(text: str) -> str:
-    """Return as much of a text as an error has room for."""
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+    """Return the first `LETTERS` letters of a text."""
+    return text if len(text) <= LETTERS else f"{text[:LETTERS]}..."
 
 
 def sort_key(name: str) -> tuple[str, str]:
-    """Return the key of published orders: base name up to its first dot; the whole name decides between equal ones."""
+    """Return the key of published orders: base name up to its first dot, then the whole name."""
     return PurePosixPath(name).name.split(".")[0], name
 
 
 def _sharp(order: list[int], photographs: Sequence[Path], k: int, rule: str) -> Split:
-    """Take the sharpest of every `k` for a test, the first of equals; photos without a measure come last."""
+    """Hold out the sharpest of every `k`, the first of equals; photos without a measure come last."""
     if len(photographs) != len(order):
-        raise ConfigError(f"scene.split is '{rule}', and not each view has a photograph of its own: use every:{k}.")
+        raise ConfigError(f"scene.split is '{rule}', but some views share a photograph or have none: use every:{k}.")
     ratios = sharpness([photographs[i] for i in order])
     blocks = [order[first : first + k] for first in range(0, len(order), k)]
     test = [max(block, key=lambda i: ratios.get(photographs[i], 0.0)) for block in blocks]
@@ -88,9 +91,10 @@ def _sharp(order: list[int], photographs: Sequence[Path], k: int, rule: str) -> 
 
 
 def _counts(order: list[int], train_count: int, test_count: int) -> Split:
+    """Spread test names evenly over the order, and training names over the rest."""
     if train_count + test_count > len(order):
         raise InputError(
-            f"scene.split asks for {train_count} + {test_count} images and the scene has {len(order)}, ask for fewer."
+            f"scene.split needs {train_count} + {test_count} images and the scene has {len(order)}: reduce the counts."
         )
     test = _spread(order, test_count)
     held_out = set(test)
@@ -98,7 +102,7 @@ def _counts(order: list[int], train_count: int, test_count: int) -> Split:
 
 
 def _spread(order: list[int], count: int) -> list[int]:
-    """`count` entries at even distances, from the middle of `count` equal parts."""
+    """Return `count` entries at even distances, from the middle of `count` equal parts."""
     return [order[(2 * k + 1) * len(order) // (2 * count)] for k in range(count)]
 
 
@@ -113,7 +117,7 @@ def _files(names: list[str], train_file: Path, test_file: Path) -> Split:
 
 
 def _listed(names: list[str], file: Path) -> list[int]:
-    """Positions of the names that `file` lists, in sorted order."""
+    """Return positions of the names that `file` lists, in sorted order."""
     if not file.is_file():
         raise InputError(f"The split file '{file}' does not exist, check scene.split.")
     lines = [line.strip() for line in read_text(file).splitlines()]
@@ -121,8 +125,21 @@ def _listed(names: list[str], file: Path) -> list[int]:
     return sorted(found, key=lambda i: sort_key(names[i]))
 
 
+def read_text(path: Path) -> str:
+    """Return the text of a file in UTF-8, or as its byte order mark says; InputError: it is unreadable."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"'{path}' cannot be read ({error.strerror}): check the file.") from None
+    encoding = next((name for mark, name in MARKS.items() if content.startswith(mark)), "utf-8")
+    try:
+        return content.decode(encoding)
+    except UnicodeDecodeError as error:
+        raise InputError(f"'{path}' is no UTF-8 text at byte {error.start}: save it as UTF-8.") from None
+
+
 def _find(names: list[str], word: str, file: Path) -> int:
-    """Position of the one name that is `word`, else of the one that is `word` plus a suffix."""
+    """Return the position of the one name that is `word`, else of the one that is `word` plus a suffix."""
     stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
     hits = [i for i, name in enumerate(names) if name == word] or [i for i, s in enumerate(stems) if s == word]
     if len(hits) != 1:

@@ -1,8 +1,8 @@
 """Scenes of transforms.json as nerfstudio and instant-ngp write it, or of a file to train on and one to test on.
 
-Poses are camera-to-world with OpenGL axes. Poses and points are used in the frame they are stored in: what
-nerfstudio records as `applied_transform` and `applied_scale` is already applied to both. Photos of bent lenses are
-undistorted as those of COLMAP scenes are. Depth maps (`depth_file_path`) are not used.
+Poses are camera-to-world with OpenGL axes. Poses and points are used as stored: nerfstudio has already applied its
+`applied_transform` and `applied_scale` to both. Photos with distortion are undistorted as in COLMAP scenes. Depth maps
+(`depth_file_path`) are not used.
 """
 
 import reprlib
@@ -20,7 +20,7 @@ from gsx.core.files import expand_home, is_file
 from gsx.core.ranges import Points, Seed
 from gsx.scenes.duplicates import photos_of
 from gsx.scenes.frame_files import FILE, TEST_FILES, TRAIN_FILE, FrameFile, frame_files, is_empty, needs_lens, nodes
-from gsx.scenes.lenses import completed, lens_of
+from gsx.scenes.lenses import complete_frame, lens_of
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.orientation import RULES, TurnsOf
@@ -32,59 +32,49 @@ from gsx.scenes.splits import Split, split_names
 from gsx.scenes.undistort import METHOD
 
 LISTS = ("train_filenames", "test_filenames", "val_filenames")
-"""Keys of lists of names (nerfstudio): to train on, to test on, and to test on where there is no such list."""
+"""Keys of lists of names (nerfstudio): to train on, to test on, and to test on without such a list."""
 FALLBACK_SPLIT = "every:8"  # with split=json, for files without lists of names
 IGNORED = ("rolling_shutter", "transform_matrix_end", "white_transparent", "black_transparent", "sharpen")
-"""Keys of instant-ngp that change how it forms pictures; others, such as aabb_scale, change only what it shows."""
+"""Keys of instant-ngp that change its training pictures; others, such as aabb_scale, change only its display."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TransformsOptions(SceneOptions):
     """Options of `conf/scene/transforms.yaml`; `path` is the folder of transforms.json, or such a file itself.
 
-    `split` can be `json` as well: the file's own train_filenames and test_filenames, or its second file, else every:8.
+    `split` can be `json` as well: the file's train_filenames and test_filenames, or its second file, else every:8.
     """
 
     points: str
     """auto: the file's ply_file_path if it has one, else random | random | a PLY file, relative to the folder."""
     random_points: Points
-    """Random points are uniform in the smallest cube around the middle of the cameras that holds them all."""
+    """Number of random points, uniform in the smallest cube around the cameras."""
     seed: Seed
-    """Of the random points."""
+    """Seed of the random points."""
 
 
 def load(options: TransformsOptions) -> Scene:
-    """Load a scene of transforms.json, or of transforms_train.json and a file to test on.
-
-    Raises:
-        InputError: a file is missing or damaged, a camera cannot be used, or there are fewer than two training images.
-    """
+    """Load a scene of transforms.json, or of a training and a test file; InputError: a file or camera is unusable."""
     parts = frame_files(expand_home(options.path))
-    by_part, notes = _shots(parts, options)
-    shots = [shot for part in by_part for shot in part]
+    shots, counts, notes, rule = list[Shot](), list[int](), list[str](), RULES[options.orientation]
+    for part in parts:
+        present, absent = present_frames(part.file.parent, part.frames, part.file, options.missing)
+        shots += [_shot(complete_frame(part.content, frame), photo, part.file, rule) for frame, photo in present]
+        counts.append(len(present))
+        notes += absent
     views = views_of(shots, options)
-    sides, split_notes = _split(parts, list(map(len, by_part)), views, options.split)
+    sides, split_notes = _split(parts, counts[0], views, options.split)
     check_sides(sides, parts[0].file)
     points, points_note = _points(parts[0], views, options)
     notes += [*shot_notes(shots), *mask_notes(views, options), *split_notes, *_ignored(parts), points_note]
     other = {"test_file": parts[-1].file.name} if parts[-1].file != parts[0].file else {}
-    bent = any(shot.remap is not None for shot in shots)
-    details = {"points": options.points, "undistortion": METHOD if bent else None, **other}
+    undistortion = METHOD if any(shot.remap is not None for shot in shots) else None
+    details = {"points": options.points, "undistortion": undistortion, **other}
     return scene_of(options, parts[0].file.parent, views, sides, points, notes, details)
 
 
-def _shots(parts: Sequence[FrameFile], options: TransformsOptions) -> tuple[list[list[Shot]], list[str]]:
-    """Return the shots of each part whose photos are on disk, and notes on those that are not."""
-    shots, notes, rule = list[list[Shot]](), list[str](), RULES[options.orientation]
-    for part in parts:
-        present, absent = present_frames(part.file.parent, part.frames, part.file, options.missing)
-        shots.append([_shot(completed(part.content, frame), photo, part.file, rule) for frame, photo in present])
-        notes += absent
-    return shots, notes
-
-
 def _shot(entry: Mapping[str, Any], photo: Path, file: Path, turns_of: TurnsOf) -> Shot:
-    """Return the shot of a frame completed by the file's common values."""
+    """Return the shot of a frame that is completed by the file's common values."""
     name = plain_name(entry["file_path"])
     place = f"Frame '{name}' of '{file}'"
     rotation, translation = pose_from_opengl(entry.get("transform_matrix"), place)
@@ -95,25 +85,21 @@ def _shot(entry: Mapping[str, Any], photo: Path, file: Path, turns_of: TurnsOf) 
 
 def _ignored(parts: Sequence[FrameFile]) -> list[str]:
     """Return a note on keys that change pictures in instant-ngp and nothing here."""
-    stated = sorted({key for part in parts for node in nodes(part) for key in IGNORED if _has_value(node.get(key))})
-    return [f"{parts[0].file.name} states {', '.join(stated)}: left out, photos are taken as they are."] * bool(stated)
-
-
-def _has_value(value: Any) -> bool:
-    """Return whether a value of a file is none of 0, false, empty, and a list of zeros."""
-    return any(value) if isinstance(value, list) else bool(value)
+    values = ((key, node.get(key)) for part in parts for node in nodes(part) for key in IGNORED)
+    stated = sorted({key for key, value in values if (any(value) if isinstance(value, list) else value)})
+    return [f"{parts[0].file.name} states {', '.join(stated)}: left out, photos are used as stored."] * bool(stated)
 
 
 def _split(
-    parts: Sequence[FrameFile], counts: Sequence[int], views: Sequence[View], rule: str
+    parts: Sequence[FrameFile], count: int, views: Sequence[View], rule: str
 ) -> tuple[tuple[list[View], list[View]], list[str]]:
-    """Return training and test views, and a note where `json` falls back; `counts`: views of each part."""
+    """Return training and test views, and a note on the split; `count`: views of the first part."""
     names, file, content = [view.name for view in views], parts[0].file, parts[0].content
     notes = []
     if rule != "json":
         train, test = split_names(names, rule, file.parent, photos_of(views))
     elif len(parts) > 1:
-        train, test = list(range(counts[0])), list(range(counts[0], len(views)))
+        train, test = list(range(count)), list(range(count, len(views)))
         notes = [f"Test views are those of {parts[1].file.name}."]
     elif any(key in content for key in LISTS):
         train, test = _listed_split(content, names, file)
@@ -124,9 +110,9 @@ def _split(
 
 
 def _listed_split(content: Mapping[str, Any], names: Sequence[str], file: Path) -> Split:
-    """Return positions of the names in the file's lists; names of photos that are not on disk are passed over.
+    """Return positions of the names in the file's lists; names of missing photos are skipped.
 
-    Without train_filenames all names are trained on that the other list does not hold.
+    Without train_filenames, all names outside the other list are trained on.
     """
     train_key, *others = LISTS
     test_key = next((key for key in others if key in content), others[0])
@@ -137,14 +123,13 @@ def _listed_split(content: Mapping[str, Any], names: Sequence[str], file: Path) 
         raise InputError(f"'{min(train & test)}' is in {train_key} and {test_key} of '{file}', remove it from one.")
     split = [i for i, name in enumerate(names) if name in train], [i for i, name in enumerate(names) if name in test]
     if not split[1]:
-        raise InputError(
-            f"{test_key} of '{file}' names no image that is on disk, use another scene.split: every:8, or none to hold "
-            "out no image."
-        )
+        remedy = "use another scene.split: every:8, or none to hold out no image"
+        raise InputError(f"{test_key} of '{file}' names no image that is on disk, {remedy}.")
     return split
 
 
 def _listed(content: Mapping[str, Any], key: str, known: set[str], file: Path) -> set[str]:
+    """Return the names of a file's list; InputError: it is no list, or holds a name that no frame has."""
     names = content.get(key, [])
     if not isinstance(names, list):
         raise InputError(f"{key} of '{file}' is {reprlib.repr(names)}: give a list, or another scene.split.")
@@ -166,8 +151,7 @@ def _points(part: FrameFile, views: Sequence[View], options: TransformsOptions) 
     if not float(2 * half) * options.unit > SAME_PLACE:
         raise InputError(
             f"All {len(views)} cameras of '{file}' stand within {float(2 * half):.3g} units of each other, as on a "
-            "tripod, and random points between them would have no depth: set scene.points to a PLY file of the scene, "
-            "or use photos from different places."
+            "tripod, so that random points would have no depth: set scene.points to a PLY file of the scene."
         )
     generator = torch.Generator().manual_seed(options.seed)
     cloud = random_points(options.random_points, middle - half, middle + half, generator)
@@ -175,11 +159,7 @@ def _points(part: FrameFile, views: Sequence[View], options: TransformsOptions) 
 
 
 def _stored(content: Mapping[str, Any], file: Path) -> str:
-    """Return the PLY file that a transforms file names, relative to its folder; `random`: it names none.
-
-    Raises:
-        InputError: there is no such file.
-    """
+    """Return a transforms file's PLY file, relative to its folder, or `random`; InputError: the file is missing."""
     name = content.get("ply_file_path")
     if name is None:
         return "random"
@@ -191,13 +171,13 @@ def _stored(content: Mapping[str, Any], file: Path) -> str:
 
 
 def recognise(path: Path) -> bool:
-    """Return whether a path is a transforms file, or the folder of one that states its cameras."""
+    """Recognise a transforms file, or the folder of one whose cameras have more than an angle of view."""
     single = (path / FILE).is_file() or (path.suffix == ".json" and path.is_file())
     return single or ((path / TRAIN_FILE).is_file() and needs_lens(path / TRAIN_FILE))
 
 
 def facts(path: Path) -> Iterator[str]:
-    """Yield how many images of each transforms file are there."""
+    """Yield a line on the images of each transforms file."""
     single = path if path.is_file() else path / FILE
     files = [single] if single.is_file() else [path / name for name in (TRAIN_FILE, *TEST_FILES)]
     return (frames_line(file) for file in files if file.is_file() and not is_empty(file))

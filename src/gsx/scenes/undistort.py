@@ -1,4 +1,4 @@
-"""Lens distortion out of the photos: the pinhole camera that sees (almost) the same, and the resampling to it.
+"""Undistortion of photos: the pinhole camera with (almost) the same field of view, and the resampling to it.
 
 The pinhole is COLMAP's (`undistort_camera` with its defaults: no blank pixels, so borders are trimmed), cut where the
 lens folds (gsx.scenes.lens_folds). Pixel centres are at +0.5 on both rasters. Sampling is cubic where COLMAP's own
@@ -24,13 +24,10 @@ from gsx.engine.cached_images import cache_image, read_cached_image
 from gsx.scenes.lens_folds import Cut, cut_where_folded, project, shows_truly
 
 ROWS_PER_BAND = 256  # rows sampled at a time: bounds the memory of the grid, whatever the photo's height
-OUTSIDE = 1.0
-"""An undistorted picture that would show what lies farther outside its photo, in sides of it, comes of no real lens."""
-STEPS = 9  # along each side of the picture, at which that is looked at
-SAME_PIXEL = 0.1
-"""Largest distance of a keypoint from the projection of its ray, px; beyond it the ray is another pixel's."""
-LEAST_FOCAL, LARGEST_FOCAL = 1e-6, 1e12
-"""Px; beyond them is no lens, and numbers overflow."""
+OUTSIDE = 1.0  # largest distance of an undistorted pixel from its photo, in sides of that: beyond, the lens is wrong
+STEPS = 9  # places along each side of the picture at which that is checked
+SAME_PIXEL = 0.1  # largest distance of a keypoint from the projection of its ray, px: beyond, it is another pixel's
+LEAST_FOCAL, LARGEST_FOCAL = 1e-6, 1e12  # px: beyond them numbers overflow
 METHOD = "keys-cubic/1"  # part of the cache key: raise the number when the resampling changes
 
 
@@ -39,35 +36,25 @@ def is_pinhole(camera: Any) -> bool:
     return bool(camera.is_perspective_pinhole() and camera.is_undistorted())
 
 
-@dataclass(frozen=True)
-class Undistorted:
-    """Result of undistorting a distorted camera."""
-
-    pinhole: Any
-    """A pycolmap PINHOLE camera."""
-    cut: Cut | None
-    """Part of its photos that is kept; None: all but the borders that COLMAP trims."""
-
-
 def pinhole_of(camera: Any) -> Any:
-    """Return the pycolmap PINHOLE camera that a photo of `camera` is undistorted to; `camera` itself if it is one.
+    """Return the pycolmap PINHOLE camera to which photos of `camera` are undistorted, itself if it is one.
 
     Raises:
-        InputError: the camera sees all round (EQUIRECTANGULAR), which no pinhole can, has a senseless distortion, or
-            has rays for too little of its photo.
+        InputError: it covers all directions (EQUIRECTANGULAR), or its distortion is impossible or leaves too little.
     """
-    if is_pinhole(camera) and np.isfinite(camera.params).all():  # to pycolmap distortion by no number is none
+    if is_pinhole(camera) and np.isfinite(camera.params).all():  # pycolmap takes NaN for no distortion
         return camera
-    return _undistorted(*_numbers(camera)).pinhole
+    return _undistorted(*_numbers(camera))[0]
 
 
 def cut_of(camera: Any) -> Cut | None:
-    """Return what is cut off a pycolmap camera's photos where its lens folds; None: nothing."""
-    return None if is_pinhole(camera) else _undistorted(*_numbers(camera)).cut
+    """Return the cut of a pycolmap camera's photos where its lens folds; None: none."""
+    return None if is_pinhole(camera) else _undistorted(*_numbers(camera))[1]
 
 
 @lru_cache(maxsize=1024)  # a lens is needed for each of its photos
-def _undistorted(model: str, width: int, height: int, params: tuple[float, ...]) -> Undistorted:
+def _undistorted(model: str, width: int, height: int, params: tuple[float, ...]) -> tuple[Any, Cut | None]:
+    """Return the pycolmap PINHOLE camera of a lens, and the part of its photos that is kept, if it folds."""
     import pycolmap
 
     camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
@@ -77,28 +64,23 @@ def _undistorted(model: str, width: int, height: int, params: tuple[float, ...])
             "cut the photos into perspective views and reconstruct those."
         )
     pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
-    found = Undistorted(pinhole, None)
+    cut: Cut | None = None
     focal = camera.focal_length_x, camera.focal_length_y
-    sensible = np.isfinite(params).all() and min(focal) > LEAST_FOCAL and max(focal) < LARGEST_FOCAL
-    if sensible and not shows_truly(camera, pinhole):
-        found = Undistorted(*cut_where_folded(camera, pinhole))
-    refuse_nonsense(camera, found.pinhole)
-    return found
-
-
-def refuse_nonsense(camera: Any, pinhole: Any) -> None:
-    """Raise InputError if what `pinhole` sees lies nowhere near the photo of `camera`; both are pycolmap cameras."""
+    valid = np.isfinite(params).all() and min(focal) > LEAST_FOCAL and max(focal) < LARGEST_FOCAL
+    if valid and not shows_truly(camera, pinhole):
+        pinhole, cut = cut_where_folded(camera, pinhole)
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-    seen = torch.cat(list(_distorted_pixels(camera, pinhole, (STEPS, STEPS)))) / size
-    if not (seen - 0.5).abs().max() <= 0.5 + OUTSIDE:  # neither for numbers that are none
+    pixels = torch.cat(list(_distorted_pixels(camera, pinhole, (STEPS, STEPS)))) / size
+    if not (pixels - 0.5).abs().max() <= 0.5 + OUTSIDE:  # true for NaN as well
         raise InputError(
-            f"The {camera.model_name} camera of a {camera.width}x{camera.height} photo bends it beyond recognition "
+            f"The {camera.model_name} camera of a {camera.width}x{camera.height} photo distorts it beyond recognition "
             f"({camera.params_to_string()}): correct its intrinsics."
         )
+    return pinhole, cut
 
 
 def camera_of(pinhole: Any, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> Camera:
-    """Return a pycolmap pinhole camera with a pose camera_from_world as gsx has it, at the same resolution."""
+    """Return the gsx camera of a pycolmap pinhole camera with a pose camera_from_world."""
     focal = {"fx": pinhole.focal_length_x, "fy": pinhole.focal_length_y}
     centre = {"cx": pinhole.principal_point_x, "cy": pinhole.principal_point_y}
     size = {"width": pinhole.width, "height": pinhole.height}
@@ -106,16 +88,13 @@ def camera_of(pinhole: Any, rotation: Float[Tensor, "3 3"], translation: Float[T
 
 
 def undistorted_size(intrinsics: Any, pinhole: Any, size: tuple[int, int]) -> tuple[int, int]:
-    """Return the size of the result for a photo of `size`, which may be reduced against the camera `intrinsics`."""
+    """Return the undistorted size of a photo of `size`, perhaps a reduction of the camera `intrinsics`."""
     width, height = size
     return round(pinhole.width * width / intrinsics.width), round(pinhole.height * height / intrinsics.height)
 
 
 def undistort_points(intrinsics: Any, pinhole: Any, positions: Float[Tensor, "K 2"]) -> Float[Tensor, "K 2"]:
-    """Return where pixels of `intrinsics` lie in `pinhole`; NaN where the lens has no ray for a pixel.
-
-    Both are pycolmap cameras, positions are in pixels, float64.
-    """
+    """Map pixels of `intrinsics` to `pinhole`, float64; NaN where the lens has no ray. Both are pycolmap cameras."""
     if intrinsics is pinhole or not len(positions):
         return positions
     rays = rays_of(intrinsics, positions)
@@ -125,9 +104,9 @@ def undistort_points(intrinsics: Any, pinhole: Any, positions: Float[Tensor, "K 
 
 
 def rays_of(intrinsics: Any, positions: Float[Tensor, "K 2"]) -> Float[Tensor, "K 2"]:
-    """Return rays (x/z, y/z) of pixels of a pycolmap camera; NaN where no ray before the camera has that pixel.
+    """Return rays (x/z, y/z) of pixels of a pycolmap camera; NaN where no ray in front of the camera has that pixel.
 
-    A ray counts if it projects to its pixel again: fisheye models mirror what lies behind the camera to the front.
+    A ray must project to its pixel again: fisheye models mirror what lies behind the camera to the front.
     """
     rays = torch.from_numpy(intrinsics.cam_from_img(positions.numpy()))
     again = torch.from_numpy(intrinsics.img_from_cam(nn.functional.pad(rays, (0, 1), value=1.0).numpy()))
@@ -138,31 +117,29 @@ def rays_of(intrinsics: Any, positions: Float[Tensor, "K 2"]) -> Float[Tensor, "
 def undistort(
     image: UInt8[Tensor, "C H W"], intrinsics: Any, pinhole: Any, size: tuple[int, int]
 ) -> UInt8[Tensor, "C h w"]:
-    """Return the photo `image` of the camera `intrinsics` as `pinhole` would have taken it, on a raster of `size`.
+    """Resample the photo `image` of the camera `intrinsics` to `pinhole`, on a raster of `size`.
 
-    Both pycolmap cameras may be of another resolution than the photo and the result: only their fields of view count.
+    Both pycolmap cameras may have another resolution than the photo and the result: only their fields of view count.
     """
-    photo = premultiplied(image.float() / 255)
-    to_photo = torch.tensor(
-        [image.shape[2] / intrinsics.width, image.shape[1] / intrinsics.height], dtype=torch.float64
-    )
+    photo, sides = premultiplied(image.float() / 255), (image.shape[2], image.shape[1])
+    to_photo = torch.tensor([sides[0] / intrinsics.width, sides[1] / intrinsics.height], dtype=torch.float64)
     bands = (sample(photo, pixels * to_photo) for pixels in _distorted_pixels(intrinsics, pinhole, size))
     return torch.cat([to_uint8(straight(band)) for band in bands], dim=1)
 
 
 def premultiplied(photo: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
-    """Multiply colours by alpha, if there is one: what is transparent has no colour to interpolate."""
+    """Multiply colours by alpha, if any: transparent pixels have no colour to interpolate."""
     return photo if len(photo) < 4 else torch.cat([photo[:3] * photo[3:], photo[3:]])
 
 
 def straight(photo: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
-    """Divide premultiplied colours by alpha, which may be beyond [0, 1]; black where nothing is opaque."""
+    """Divide premultiplied colours by alpha, which may exceed [0, 1]; black at alpha 0."""
     colours, alpha = photo[:3], photo[3:]
     return photo if len(photo) < 4 else torch.cat([torch.where(alpha > 0, colours / alpha, 0.0), alpha])
 
 
 def _distorted_pixels(intrinsics: Any, pinhole: Any, size: tuple[int, int]) -> Iterator[Float[Tensor, "h w 2"]]:
-    """Yield, band by band, where `intrinsics` sees what each pixel of the result shows, in its pixels."""
+    """Yield the pixels of `intrinsics` for each pixel of the result, band by band."""
     width, height = size
     columns = (torch.arange(width, dtype=torch.float64) + 0.5) * (pinhole.width / width)
     rows = (torch.arange(height, dtype=torch.float64) + 0.5) * (pinhole.height / height)
@@ -197,7 +174,7 @@ def _keys(t: Float[Tensor, "*shape"]) -> Float[Tensor, "4 *shape"]:
 
 @dataclass(frozen=True, eq=False)
 class StoredUndistortion:
-    """Undistortion of one photo, its result kept as PNG between runs."""
+    """Undistortion of one photo, with its result kept as PNG between runs."""
 
     photo: Path
     intrinsics: Any
@@ -205,7 +182,7 @@ class StoredUndistortion:
     size: tuple[int, int]
     """(width, height) of the result."""
     turned: int = 1
-    """EXIF orientation that was applied to the stored photo beforehand."""
+    """EXIF orientation applied to the stored photo beforehand."""
 
     def __call__(self, image: UInt8[Tensor, "C H W"]) -> UInt8[Tensor, "C h w"]:
         stored = self.stored()
@@ -218,7 +195,7 @@ class StoredUndistortion:
         return result
 
     def stored(self) -> Path:
-        """Return the place of the result; another photo, camera or method has another one."""
+        """Return the place of the result in the cache, by photo, cameras and method."""
         lenses = ((*_numbers(lens)[:3], lens.params.tolist()) for lens in (self.intrinsics, self.pinhole))
         key = content_key(METHOD, "premultiplied", *lenses, self.size)
         turned = [self.turned] if self.turned != 1 else []

@@ -129,7 +129,7 @@ def test_blender_scene_with_absent_photos(tmp_path: Path) -> None:
         "3 of 3 of transforms_train.json",
     ]
     (problem,) = labelled(lines, "problem")
-    assert problem.endswith("train on what is there with scene.missing=0.25 or more.")
+    assert problem.endswith("train on the others with scene.missing=0.25 or more.")
     assert labelled(lines, "then") == [f"gsx scene=blender scene.path={tmp_path}"]
 
 

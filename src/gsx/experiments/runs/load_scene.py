@@ -17,7 +17,7 @@ from gsx.experiments.evaluation.remarks import NOT_MEASURED
 from gsx.experiments.runs.degraded import degrade
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.origin import Origin
-from gsx.scenes.filling import filled
+from gsx.scenes.filling import fill_gaps
 from gsx.scenes.origin import around_origin, origin_of
 from gsx.scenes.posed import SAME_PLACE
 
@@ -106,6 +106,24 @@ def count_notes(settings: Settings) -> list[str]:
     images = getattr(settings.scene.options, "images", "") or "images"
     count, compared = file_count(expand_home(path) / images), "figures cannot be compared with published ones"
     return [] if count == published else [f"{images}/ holds {count} files, published are {published}: {compared}."]
+
+
+def with_more_points(scene: Scene, count: int, seed: int) -> Scene:
+    """Returns the scene with points where training views show none."""
+    if count == 0:
+        return scene
+    return fill_gaps(scene, count, torch.Generator().manual_seed(derived_seed("fill", seed)))
+
+
+def checked_unit(unit: float) -> float:
+    """Returns the unit.
+
+    Raises:
+        ConfigError: it is not a positive number.
+    """
+    if not 0 < unit < math.inf:
+        raise ConfigError(f"scene.unit is {unit}; give a positive number")
+    return unit
 
 
 def placed(scene: Scene, unit: float, origin: Origin | None) -> Scene:

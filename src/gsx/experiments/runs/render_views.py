@@ -23,7 +23,7 @@ from gsx.experiments.runs.start_file import refuse_nothing_in_view, rules_of
 from gsx.experiments.viewer.camera_path import CameraPath
 from gsx.formats.axis_names import AUTO
 from gsx.formats.splat_files import read_around
-from gsx.scenes.origin import moved
+from gsx.scenes.origin import relative_camera
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ def render_orbit(run: Run, settings: Settings, path: Path, frames: int, fps: flo
 def run_pictures(run: Run, settings: Settings) -> Draw:
     """Return a function that renders a run for any camera in the coordinates of the scene's files."""
     pixels, origin = settings.evaluation.tile_pixels, run.scene.origin
-    return lambda camera: render(run, moved(camera, origin), pixels).image
+    return lambda camera: render(run, relative_camera(camera, origin), pixels).image
 
 
 def file_pictures(path: Path, cameras: Sequence[Camera] = (), axes: str = AUTO) -> Draw:
@@ -75,9 +75,10 @@ def file_pictures(path: Path, cameras: Sequence[Camera] = (), axes: str = AUTO) 
     watch_cores()
     (gaussians, origin), raster = read_around(path, axes), rules_of(path)
     if cameras:
-        around = [moved(camera, origin) for camera in cameras]
-        refuse_nothing_in_view(gaussians, around, "camera of the path", path, origin)
-    return lambda camera: render_gaussians(gaussians, moved(camera, origin), raster, torch.zeros(3))
+        refuse_nothing_in_view(
+            gaussians, [relative_camera(camera, origin) for camera in cameras], "camera of the path", path, origin
+        )
+    return lambda camera: render_gaussians(gaussians, relative_camera(camera, origin), raster, torch.zeros(3))
 
 
 def render_path(

@@ -1,4 +1,4 @@
-"""LoRA adapters: added to a model, kept on disk, taken up again, merged."""
+"""LoRA adapters: added to a model, kept on disk, read again, merged."""
 
 import hashlib
 import json
@@ -16,29 +16,22 @@ from gsx.regenerators.diffusion.options import TuningOptions
 
 logger = logging.getLogger(__name__)
 
-ADAPTERS = "lora"
-"""Kind of the adapters in the cache."""
-
-
+ADAPTERS = "lora"  # folder of the cache
 WEIGHTS, FACTS = "adapter.safetensors", "adapter.json"
 
 
 def add_adapter(pipe: Any, tuning: TuningOptions, seed: int) -> list[torch.nn.Parameter]:
-    """What is trained: low-rank changes of some layers, zero at first, in float32; everything else is frozen."""
+    """Add low-rank changes of some layers, zero at first, in float32; freeze the rest; returns what to train."""
     from peft import LoraConfig
 
     for network in (pipe.unet, pipe.vae, pipe.text_encoder, pipe.text_encoder_2):
         network.requires_grad_(False)
+    config = LoraConfig(
+        r=tuning.rank, lora_alpha=tuning.rank, init_lora_weights="gaussian", target_modules=list(tuning.layers)
+    )
     with torch.random.fork_rng():  # peft draws from the global generator
         torch.manual_seed(seed)
-        pipe.unet.add_adapter(
-            LoraConfig(
-                r=tuning.rank,
-                lora_alpha=tuning.rank,
-                init_lora_weights="gaussian",
-                target_modules=list(tuning.layers),
-            )
-        )
+        pipe.unet.add_adapter(config)
     adapted = [parameter for parameter in pipe.unet.parameters() if parameter.requires_grad]
     for parameter in adapted:
         parameter.data = parameter.data.float()
@@ -46,7 +39,7 @@ def add_adapter(pipe: Any, tuning: TuningOptions, seed: int) -> list[torch.nn.Pa
 
 
 def adapter_bytes(pipe: Any) -> bytes:
-    """The adapter as `diffusers` writes it."""
+    """Return the adapter as `diffusers` writes it."""
     from peft.utils import get_peft_model_state_dict
 
     with TemporaryDirectory() as folder:
@@ -54,8 +47,8 @@ def adapter_bytes(pipe: Any) -> bytes:
         return (Path(folder) / WEIGHTS).read_bytes()
 
 
-def adopted(shared: Path, own: Path) -> bool:
-    """Whether the cache had the adapter; it is then in the run's folder too."""
+def copy_from_cache(shared: Path, own: Path) -> bool:
+    """Copy the cache's adapter to the run's folder; returns whether there is one."""
     if not is_intact(shared / FACTS):
         return False
     try:
@@ -68,23 +61,23 @@ def adopted(shared: Path, own: Path) -> bool:
 
 
 def share(own: Path, shared: Path) -> None:
-    """Lets later runs have the adapter; a cache that cannot be written is no error."""
+    """Copy the run's adapter to the cache; warn if that cannot be written."""
     try:
         copy_adapter(own, make_folder(shared))
-        add_to_manifest(shared / FACTS)  # which have the digest of the weights
+        add_to_manifest(shared / FACTS)  # which hold the digest of the weights
     except (OSError, InputError) as error:
         logger.warning("%s: later runs will learn again", error)
 
 
 def copy_adapter(source: Path, target: Path) -> None:
-    """From folder to folder; what tells that it is whole comes last."""
+    """Copy an adapter between folders; the facts come last, as the mark of a whole one."""
     target.mkdir(parents=True, exist_ok=True)
     for name in (WEIGHTS, FACTS):
         replace_file(target / name, (source / name).read_bytes())
 
 
 def read_facts(folder: Path) -> dict[str, Any]:
-    """What is known of the adapter in a folder."""
+    """Read the facts on an adapter; TrainingError: it is damaged."""
     try:
         facts: dict[str, Any] = json.loads((folder / FACTS).read_text(encoding="utf-8"))
         if hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest() == facts["sha256"]:
@@ -96,7 +89,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
 
 
 def merge(pipe: Any, folder: Path) -> None:
-    """Adds an adapter to the weights of a model."""
+    """Add an adapter to the weights of a model."""
     pipe.load_lora_weights(folder, weight_name=WEIGHTS, local_files_only=True)
     pipe.fuse_lora()
     pipe.unload_lora_weights()

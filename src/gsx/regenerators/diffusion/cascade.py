@@ -16,15 +16,15 @@ from gsx.regenerators.diffusion.redraw import Diffusion
 
 @dataclass(frozen=True, kw_only=True)
 class CascadeOptions:
-    """Options; values in conf/regenerator/upscale/sd_by_scale.yaml."""
+    """Options of conf/regenerator/upscale/sd_by_scale.yaml."""
 
     name: str
     x2: UpscalerOptions
     x4: UpscalerOptions
 
 
-def rungs(scale: int) -> list[int]:
-    """Factors whose product is the scale, the larger first (the paper: x8 is x4, then x2); x1 has none."""
+def factors_of(scale: int) -> list[int]:
+    """Factor a scale into 4s and then a 2 (the paper: x8 is x4, then x2); ConfigError: it is no power of two."""
     power = scale.bit_length() - 1
     if scale != 1 << power:
         raise ConfigError(f"regenerator sd_by_scale enlarges x2, x4, x8, not x{scale}: change the augmenter's scales")
@@ -32,7 +32,7 @@ def rungs(scale: int) -> list[int]:
 
 
 class Cascade:
-    """Two upscalers; only those that the scales need are looked for and loaded."""
+    """Two upscalers, of which only those that the scales need are located and loaded."""
 
     def __init__(self, options: CascadeOptions) -> None:
         self.models = {
@@ -42,26 +42,24 @@ class Cascade:
         self.needed: set[int] = set()
 
     def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
-        """The models that will be needed are there."""
-        self.needed |= {factor for scale in scales for factor in rungs(scale)}
+        """Raise ConfigError or InputError if a scale cannot be reached or a model is missing."""
+        self.needed |= {factor for scale in scales for factor in factors_of(scale)}
         for factor in sorted(self.needed):
             self.models[factor].check(views, [factor], moved)
 
     def prepare(self, context: RegeneratorContext) -> dict[str, float]:
-        """Opens them."""
-        return {
-            f"x{factor}_{name}": value
-            for factor in sorted(self.needed)
-            for name, value in self.models[factor].prepare(context).items()
-        }
+        """Open the models that are needed."""
+        prepared = {factor: self.models[factor].prepare(context) for factor in sorted(self.needed)}
+        return {f"x{factor}_{name}": value for factor, metrics in prepared.items() for name, value in metrics.items()}
 
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
-        """Each picture, in order, by one model after the other."""
-        images = {number: request.image for number, request in enumerate(requests)}
-        ways = [rungs(request.scale) for request in requests]
-        for turn in range(max(map(len, ways), default=0)):
+        """Enlarge each picture by one model after the other."""
+        images = [request.image for request in requests]
+        chains = [factors_of(request.scale) for request in requests]
+        for turn in range(max(map(len, chains), default=0)):
             for factor, model in self.models.items():
-                due = [n for n, way in enumerate(ways) if way[turn : turn + 1] == [factor]]
-                asked = [replace(requests[n], image=images[n], scale=factor) for n in due]
-                images |= dict(zip(due, model.regenerate(asked), strict=True))
-        return [images[number] for number in range(len(requests))]
+                due = [n for n, chain in enumerate(chains) if chain[turn : turn + 1] == [factor]]
+                results = model.regenerate([replace(requests[n], image=images[n], scale=factor) for n in due])
+                for n, result in zip(due, results, strict=True):
+                    images[n] = result
+        return images

@@ -1,5 +1,6 @@
-"""What is known of each model: where it is, what sizes it takes, how it is called (diffusers)."""
+"""Facts on each model: where it is, what sizes it takes, how `diffusers` calls it."""
 
+import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.shapes import Float
+from gsx.engine.cache import content_key
 from gsx.regenerators.diffusion.options import DiffusionOptions, PipelineOptions, UpscalerOptions
 
 
@@ -22,20 +24,24 @@ class Batch:
     prompts: Sequence[str]
     seeds: Sequence[int]
     strength: float
-    """How much may change, the same for all."""
+    """Amount of change from 0 to 1, the same for all."""
     references: Float[Tensor, "B 3 h w"] | None = None
-    """Photographs of the training views they were made from."""
+    """Photographs of their training views."""
 
     def __len__(self) -> int:
         return len(self.prompts)
 
-    def generators(self) -> list[torch.Generator]:
-        """One for each picture, so that no result depends on its company; on the CPU, so that noise does not depend
-        on the device."""
-        return [torch.Generator().manual_seed(seed) for seed in self.seeds]
+    def contents(self) -> list[str]:
+        """Digest all inputs that decide a picture's result but the others of its batch, for each picture."""
+        inputs = (self.images,) if self.references is None else (self.images, self.references)
+        exact = [
+            hashlib.sha256(b"".join(map(bytes_of, pictures))).hexdigest() for pictures in zip(*inputs, strict=True)
+        ]
+        parts = zip(exact, self.seeds, self.prompts, strict=True)
+        return [content_key(one, seed, self.strength, prompt) for one, seed, prompt in parts]
 
     def part(self, first: int, last: int) -> "Batch":
-        """Pictures `first` up to `last`."""
+        """Return pictures `first` up to `last`."""
         return Batch(
             images=self.images[first:last],
             prompts=self.prompts[first:last],
@@ -50,27 +56,27 @@ class ModelSpec:
     """A model and its pipeline."""
 
     hub: str
-    """Where it is officially obtained."""
-    gigabytes: float
-    """Of what is fetched; 0: unknown."""
+    """Its id on the hub."""
+    gigabytes: float = 0
+    """Size of the download, 10^9 bytes; 0: unknown."""
     loader: str
     """Class of `diffusers` that opens it."""
-    accepted: Sequence[str]
+    accepted: Sequence[str] = ()
     """Classes that its model_index.json may name."""
-    networks: Sequence[str]
+    networks: Sequence[str] = ()
     """Folders with weights."""
-    others: Sequence[str]
-    """Folders without."""
+    others: Sequence[str] = ()
+    """Folders without weights."""
     factor: int
-    """Results are so many times as wide and high."""
-    multiple: int
-    """Of which both sides of a picture must be a multiple, px."""
-    least: int
+    """Results are this many times as wide and high."""
+    multiple: int = 8
+    """Divisor of both sides of a picture, px."""
+    least: int = 8
     """Shortest side, px."""
     call: Callable[[Any, Batch, Any], Tensor]
     """(pipeline, pictures, options) -> results, display values."""
     reference: bool = False
-    """Whether it is shown photographs as well."""
+    """It takes the photograph of the training view as well."""
     replaced: dict[str, Any] = field(default_factory=dict)
     """Parts that are not loaded, or set otherwise: no picture is marked or blackened."""
     code: Path | None = None
@@ -80,13 +86,18 @@ class ModelSpec:
 
     @property
     def where(self) -> str:
-        """Key of its options."""
+        """Return the key of its options."""
         role = "upscale" if self.factor > 1 else "restore"
         return ".".join(key for key in ("regenerator", role, self.part) if key)
 
 
+def bytes_of(picture: Float[Tensor, "3 H W"]) -> bytes:
+    """Return shape and values for a digest: flat pictures of different shapes have the same values."""
+    return repr(tuple(picture.shape)).encode() + picture.numpy().tobytes()
+
+
 def steps_for(strength: float, steps: int) -> int:
-    """The steps to ask for; 0: as many as let image-to-image, which executes int(steps * strength), execute one.
+    """Return `steps`; for 0, as many as let image-to-image, which executes int(steps * strength), execute one.
 
     floor(1/s) + 1, the authors' rule, which for s = 1 would execute two; ceil(1/s) ends in none for some strengths
     (diffusers).
@@ -95,23 +106,24 @@ def steps_for(strength: float, steps: int) -> int:
 
 
 def pictures_of(pipe: Any, batch: Batch, steps: int, guidance: float, **more: Any) -> Tensor:
-    """What a pipeline makes of a batch, unrounded."""
-    told = {"prompt": list(batch.prompts), "image": batch.images, "generator": batch.generators()}
-    return pipe(**(told | more), num_inference_steps=steps, guidance_scale=guidance, output_type="pt").images
+    """Call a pipeline; returns its pictures, unrounded."""
+    generators = [torch.Generator().manual_seed(seed) for seed in batch.seeds]  # one each, independent of the device
+    arguments = {"prompt": list(batch.prompts), "image": batch.images, "generator": generators} | more
+    return pipe(**arguments, num_inference_steps=steps, guidance_scale=guidance, output_type="pt").images
 
 
 def upscale_latents(pipe: Any, batch: Batch, options: UpscalerOptions) -> Tensor:
-    """StableDiffusionLatentUpscalePipeline."""
+    """Call StableDiffusionLatentUpscalePipeline."""
     return pictures_of(pipe, batch, options.steps, options.guidance)
 
 
 def upscale_pixels(pipe: Any, batch: Batch, options: UpscalerOptions) -> Tensor:
-    """StableDiffusionUpscalePipeline."""
+    """Call StableDiffusionUpscalePipeline."""
     return pictures_of(pipe, batch, options.steps, options.guidance, noise_level=options.noise_level)
 
 
 def restore(pipe: Any, batch: Batch, options: DiffusionOptions) -> Tensor:
-    """StableDiffusionXLImg2ImgPipeline; a strength at which no step would be executed changes nothing."""
+    """Call StableDiffusionXLImg2ImgPipeline; a strength at which no step would be executed changes nothing."""
     steps = steps_for(batch.strength, options.steps) if batch.strength > 0 else 0
     if int(steps * batch.strength) < 1:
         return batch.images
@@ -119,7 +131,7 @@ def restore(pipe: Any, batch: Batch, options: DiffusionOptions) -> Tensor:
 
 
 def redraw(pipe: Any, batch: Batch, options: PipelineOptions) -> Tensor:
-    """Any pipeline that takes `image` and `prompt`."""
+    """Call any pipeline that takes `image` and `prompt`."""
     more = dict(options.arguments)
     if options.prompt:
         more["prompt"] = [options.prompt] * len(batch)
@@ -129,14 +141,10 @@ def redraw(pipe: Any, batch: Batch, options: PipelineOptions) -> Tensor:
 
 
 def spec_of(options: PipelineOptions) -> ModelSpec:
-    """What the options say of a pipeline."""
+    """Return the spec of a pipeline that its options describe."""
     return ModelSpec(
         hub=options.model,
-        gigabytes=0,
         loader="DiffusionPipeline",
-        accepted=(),
-        networks=(),
-        others=(),
         factor=options.scale,
         multiple=options.multiple,
         least=options.least,
@@ -167,8 +175,6 @@ SD_X4 = ModelSpec(
     networks=("vae", "text_encoder", "unet"),
     others=("tokenizer", "scheduler", "low_res_scheduler"),
     factor=4,
-    multiple=8,
-    least=8,
     call=upscale_pixels,
     replaced={"safety_checker": None, "feature_extractor": None, "watermarker": None},
 )
@@ -180,8 +186,6 @@ SDXL_TURBO = ModelSpec(
     networks=("vae", "text_encoder", "text_encoder_2", "unet"),
     others=("tokenizer", "tokenizer_2", "scheduler"),
     factor=1,
-    multiple=8,
-    least=8,
     call=restore,
     replaced={"add_watermarker": False},
 )

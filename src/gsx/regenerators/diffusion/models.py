@@ -1,4 +1,4 @@
-"""From a folder or an id to a pipeline in memory. Nothing asks the network unless `download=true`."""
+"""From a folder or an id to a pipeline in memory. Nothing uses the network unless `download=true`."""
 
 import hashlib
 import json
@@ -20,16 +20,10 @@ logger = logging.getLogger(__name__)
 
 INDEX = "model_index.json"
 PACKAGES = ("diffusers", "transformers", "accelerate")
-CHUNK = 1 << 24
-"""Bytes read at a time."""
 
 
-def located(options: DiffusionOptions, spec: ModelSpec) -> Path:
-    """The folder of a model, fetched first if it may be.
-
-    Raises:
-        InputError: it is not on this machine, is another model, or damaged. The message says what to do.
-    """
+def find_model(options: DiffusionOptions, spec: ModelSpec) -> Path:
+    """Return the folder of a model, fetched first with `download=true`; InputError: it is missing or unusable."""
     folder = expand_home(options.model)
     if not folder.is_dir():
         folder = snapshot(options, spec)
@@ -38,74 +32,78 @@ def located(options: DiffusionOptions, spec: ModelSpec) -> Path:
 
 
 def snapshot(options: DiffusionOptions, spec: ModelSpec) -> Path:
-    """The folder of a hub's id in the cache of huggingface_hub."""
+    """Return the folder of a hub's id in the cache of huggingface_hub."""
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HFValidationError
 
+    include, exclude = patterns(options)
     try:
         return Path(
             snapshot_download(
                 options.model,
                 revision=options.revision,
-                allow_patterns=wanted(options),
-                ignore_patterns=unwanted(options),
+                allow_patterns=include,
+                ignore_patterns=exclude,
                 local_files_only=not options.download,
             )
         )
     except HFValidationError:
         why = "it is no folder, and no id of the form owner/model"
     except Exception as error:  # each version of the hub's client raises its own families of errors
-        if partial := getattr(error, "snapshot_path", None):  # something is there: what is missing is told below
+        if partial := getattr(error, "snapshot_path", None):  # `inspect` reports what is missing
             return Path(partial)
         why = first_line(error) if options.download else "it is no folder, and not in the cache of the hub's client"
     raise InputError(f"regenerator {options.name} finds no model '{options.model}' ({why}). {remedy(options, spec)}")
 
 
-def wanted(options: DiffusionOptions) -> list[str]:
-    """Patterns of the files of a model: the networks' folders, not the single files beside them."""
+def patterns(options: DiffusionOptions) -> tuple[list[str], list[str]]:
+    """Return patterns of the files of a model, in the networks' folders, and of those of other variants."""
     weights = f"*/*.{options.variant}*.safetensors" if options.variant else "*/*.safetensors"
-    return [INDEX, "*/*.json", "*/*.txt", "*/*.model", weights]
-
-
-def unwanted(options: DiffusionOptions) -> list[str]:
-    """Patterns that `wanted` matches too many of."""
-    return [] if options.variant else ["*/*.*.safetensors"]
+    exclude = [] if options.variant else ["*/*.*.safetensors"]
+    return [INDEX, "*/*.json", "*/*.txt", "*/*.model", weights], exclude
 
 
 def remedy(options: DiffusionOptions, spec: ModelSpec) -> str:
-    """Which files, how large, where to put them, and the command that does so."""
+    """Return the files and their size, where to put them, and the command that does so, as sentences."""
     name, folder = spec.hub, f"models/{spec.hub.split('/')[-1]}"
-    patterns = " ".join(f"--include '{pattern}'" for pattern in wanted(options))
-    patterns += "".join(f" --exclude '{pattern}'" for pattern in unwanted(options))
+    include, exclude = patterns(options)
+    filters = " ".join(f"--include '{one}'" for one in include) + "".join(f" --exclude '{one}'" for one in exclude)
     folders = ", ".join((*spec.networks, *spec.others)) or "that it names"
     size = f", about {spec.gigabytes:g} GB" if spec.gigabytes else ""
     return (
-        f"It needs {INDEX} and the folders {folders}{size}: hf download {name} {patterns} --local-dir {folder}; then "
+        f"It needs {INDEX} and the folders {folders}{size}: hf download {name} {filters} --local-dir {folder}; then "
         f"{spec.where}.model={folder}. Or let gsx fetch it: {spec.where}.download=true. "
         "Without diffusion: budget=quick"
     )
 
 
 def inspect(folder: Path, options: DiffusionOptions, spec: ModelSpec) -> None:
-    """Whether a folder holds what the spec needs, as far as can be told without reading the weights."""
+    """Raise InputError if a folder lacks what the spec needs; weights are checked by their headers."""
+    from safetensors import SafetensorError, safe_open
+
     pipeline = class_named(folder, options, spec)
     if spec.accepted and pipeline not in spec.accepted:
         raise InputError(
             f"regenerator {options.name}: {folder / INDEX} is that of a {pipeline}, and must be that of a "
             f"{' or '.join(spec.accepted)}: set {spec.where}.model to another folder"
         )
+    name = f"*.{options.variant}.safetensors" if options.variant else "*.safetensors"
     missing = [part for part in (*spec.networks, *spec.others) if not (folder / part).is_dir()]
-    missing += [f"{part}/{weights_name(options)}" for part in spec.networks if not weights_of(folder / part, options)]
+    missing += [f"{part}/{name}" for part in spec.networks if not weights_of(folder / part, options)]
     if missing:
         raise InputError(f"regenerator {options.name}: {folder} lacks {', '.join(missing)}. {remedy(options, spec)}")
     if spec.code is not None and not spec.code.is_file():
         raise InputError(f"regenerator {options.name}: there is no file custom={spec.code}")
     for path in all_weights(folder, options):
-        refuse_damaged(path, options)
+        try:
+            with safe_open(path, framework="pt"):  # fails if the header does not fit the file's length
+                pass
+        except (OSError, SafetensorError) as error:
+            raise InputError(f"regenerator {options.name}: {path} is damaged ({error}): fetch it again") from error
 
 
 def class_named(folder: Path, options: DiffusionOptions, spec: ModelSpec) -> str:
-    """The class of pipeline that a folder says it is."""
+    """Return the class of pipeline that a folder's index names."""
     try:
         return str(json.loads((folder / INDEX).read_text(encoding="utf-8"))["_class_name"])
     except FileNotFoundError:
@@ -116,13 +114,8 @@ def class_named(folder: Path, options: DiffusionOptions, spec: ModelSpec) -> str
         ) from error
 
 
-def weights_name(options: DiffusionOptions) -> str:
-    """What files of weights are called."""
-    return f"*.{options.variant}.safetensors" if options.variant else "*.safetensors"
-
-
 def weights_of(folder: Path, options: DiffusionOptions) -> list[Path]:
-    """Files of weights of a network: NAME.safetensors, or NAME.VARIANT.safetensors, either in numbered pieces."""
+    """Return a network's files of weights: NAME.safetensors, or NAME.VARIANT.safetensors, either in numbered pieces."""
     files = sorted(folder.glob("*.safetensors"))
     if options.variant:
         return [path for path in files if path.stem.partition(".")[2].partition("-")[0] == options.variant]
@@ -130,25 +123,14 @@ def weights_of(folder: Path, options: DiffusionOptions) -> list[Path]:
 
 
 def all_weights(folder: Path, options: DiffusionOptions) -> list[Path]:
-    """Those that `diffusers` reads: of each network the variant's, or, where there are none, the plain ones."""
+    """Return the files that `diffusers` reads: of each network the variant's, else the plain ones."""
     plain = replace(options, variant="")
     parts = sorted(part for part in folder.iterdir() if part.is_dir())
     return [path for part in parts for path in weights_of(part, options) or weights_of(part, plain)]
 
 
-def refuse_damaged(path: Path, options: DiffusionOptions) -> None:
-    """Raises InputError if a file's header does not fit its length."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt"):
-            pass
-    except (OSError, SafetensorError) as error:
-        raise InputError(f"regenerator {options.name}: {path} is damaged ({error}): fetch it again") from error
-
-
 def fingerprint(folder: Path, options: DiffusionOptions, spec: ModelSpec) -> str:
-    """SHA-256 of everything in files that decides what a model draws."""
+    """Return the SHA-256 of all files that decide what a model draws."""
     digest = hashlib.sha256()
     files = [path for path in folder.rglob("*") if path.suffix in (".json", ".txt", ".model", ".py")]
     files += all_weights(folder, options)
@@ -156,32 +138,27 @@ def fingerprint(folder: Path, options: DiffusionOptions, spec: ModelSpec) -> str
     for path in sorted(set(files)):
         digest.update(f"{path.name} {path.parent.name} {path.stat().st_size}\n".encode())
         with path.open("rb") as stream:
-            while piece := stream.read(CHUNK):
+            while piece := stream.read(1 << 24):
                 digest.update(piece)
     return digest.hexdigest()
 
 
 def code_stamp() -> str:
-    """Of the code of regenerators and the libraries it calls: what they draw may change with them."""
-    return content_key(
-        source_digest(Path(__file__).parents[1]), *(version(package) for package in ("torch", *PACKAGES, "safetensors"))
-    )
+    """Return a digest of the regenerators' code and of the versions of its libraries: results may change with them."""
+    versions = (version(package) for package in ("torch", *PACKAGES, "safetensors"))
+    return content_key(source_digest(Path(__file__).parents[1]), *versions)
 
 
 def number_type(options: DiffusionOptions, device: torch.device) -> torch.dtype:
-    """What a model computes in."""
+    """Return the type in which a model computes."""
     name = options.dtype
     if name == "auto":
         name = "bfloat16" if device.type == "cuda" else "float32"
     return {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}[name]
 
 
-def opened(folder: Path, options: DiffusionOptions, spec: ModelSpec, dtype: torch.dtype) -> Any:
-    """The pipeline of a folder, in main memory.
-
-    Raises:
-        TrainingError: it cannot be loaded; the run keeps its checkpoint.
-    """
+def open_pipeline(folder: Path, options: DiffusionOptions, spec: ModelSpec, dtype: torch.dtype) -> Any:
+    """Load the pipeline of a folder into main memory; TrainingError: it cannot be loaded."""
     import diffusers
 
     for library in ("diffusers", "transformers"):
@@ -210,7 +187,7 @@ def opened(folder: Path, options: DiffusionOptions, spec: ModelSpec, dtype: torc
 
 
 def place(pipe: Any, options: DiffusionOptions, device: torch.device) -> None:
-    """Onto the device, or half-way."""
+    """Move a pipeline to the device, or as `offload` says."""
     if options.offload != "none" and device.type == "cpu":
         logger.warning("regenerator %s: offload=%s does nothing on the CPU", options.name, options.offload)
     if options.offload == "none" or device.type == "cpu":

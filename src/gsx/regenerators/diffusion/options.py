@@ -12,21 +12,21 @@ OFFLOADS = ("none", "model", "sequential")
 
 @dataclass(frozen=True, kw_only=True)
 class DiffusionOptions:
-    """Where a model comes from, how it fits into memory, and what every pipeline is told."""
+    """Options of every pipeline: source of the model, use of memory, arguments."""
 
     name: str
     model: str
     """Folder that holds model_index.json, or an id on the Hugging Face hub."""
     revision: str
-    """Of an id: branch, tag or commit."""
+    """Branch, tag or commit of an id."""
     variant: str
     """Part of the names of weight files, such as fp16; empty: none."""
     download: bool = without_effect()
-    """Whether an id that is not on this machine is fetched; else nothing ever asks the network."""
+    """Fetch an id that is not on this machine; otherwise nothing uses the network."""
     dtype: str
     """auto: bfloat16 on a GPU, float32 on the CPU."""
     offload: str = without_effect()
-    """What stays in main memory while it is not needed: none, model (whole networks), sequential (layers; slow)."""
+    """Parts kept in main memory while idle: none, model (whole networks), sequential (layers; slow)."""
     slicing: bool = without_effect()
     """Encode and decode one picture of a batch at a time."""
     tiling: bool
@@ -34,7 +34,7 @@ class DiffusionOptions:
     batch_pixels: Annotated[int, Range(1, 1 << 31)] = without_effect()
     """Pixels of the results of one call; one picture at least."""
     cached: bool = without_effect()
-    """Whether results are kept in the cache for later runs."""
+    """Keep results in the cache for later runs."""
     guidance: Annotated[float, Range(0, 1000)]
     """1: none (no second pass without the prompt)."""
     steps: Annotated[int, Range(0, 10000)]
@@ -52,53 +52,46 @@ class DiffusionOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class UpscalerOptions(DiffusionOptions):
-    """Of an upscaler."""
+    """Options of an upscaler."""
 
+    steps: Annotated[int, Range(1, 10000)]
+    """Denoising steps."""
     noise_level: Annotated[int, Range(0, 10000)]
-    """Noise on what is enlarged, as a step of the model's schedule (x4 alone)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.steps < 1:
-            raise ValueError(f"regenerator {self.name}: steps must be at least 1")
+    """Noise on the input, as a step of the model's schedule (x4 alone)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PipelineOptions(DiffusionOptions):
-    """Of any other pipeline from picture to picture; `guidance` and `steps` are its guidance_scale and
-    num_inference_steps."""
+    """Options of any other pipeline from picture to picture."""
 
+    steps: Annotated[int, Range(1, 10000)]
+    """Its num_inference_steps; `guidance` is its guidance_scale."""
     custom: str
     """File of a pipeline that is not in `diffusers`; empty: the class that model_index.json names."""
     scale: Annotated[int, Range(1, 64)]
-    """Its results are so many times as wide and high; 1: it restores."""
+    """Its results are this many times as wide and high; 1: it restores."""
     multiple: Annotated[int, Range(1, 4096)]
-    """Of which both sides of a picture must be a multiple, px."""
+    """Divisor of both sides of a picture, px."""
     least: Annotated[int, Range(1, 4096)]
-    """Shortest side that it takes, px."""
+    """Shortest side, px."""
     prompt: str
-    """In place of the augmenter's; empty: that one."""
+    """Prompt in place of the augmenter's; empty: that one."""
     reference: str
     """Argument that takes the photograph of the same training view, enlarged or reduced to the picture's size; empty:
     none."""
     arguments: dict[str, Any]
-    """What else it is called with."""
+    """Its other arguments."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.steps < 1:
-            raise ValueError(f"regenerator {self.name}: steps must be at least 1")
         if self.custom and not self.custom.endswith(".py"):
             raise ValueError(f"regenerator {self.name}: custom is '{self.custom}'; give a file ending in .py")
         ours = {"image", "prompt", "generator", "output_type", "num_inference_steps", "guidance_scale", self.reference}
-        taken = set(self.arguments) & ours
-        if taken:
-            raise ValueError(
-                f"regenerator {self.name}: arguments may not hold {', '.join(sorted(taken))}: gsx gives them itself"
-            )
+        if taken := sorted(set(self.arguments) & ours):
+            raise ValueError(f"regenerator {self.name}: arguments may not hold {', '.join(taken)}: gsx sets them")
 
     def named_code(self) -> str:
-        """The file of the pipeline."""
+        """Return the file of the pipeline."""
         return self.custom
 
 
@@ -107,10 +100,10 @@ class TuningOptions:
     """Per-scene LoRA on (render, photograph) pairs."""
 
     steps: Steps
-    """0: the model is used as it is."""
+    """Training steps; 0: the model is used as it is."""
     rank: Annotated[int, Range(1, 4096)]
     layers: list[str]
-    """Ends of the names of the layers that are adapted."""
+    """Ends of the names of the adapted layers."""
     rate: Rate
     warm_up: Steps
     """Steps in which the rate rises to `rate`."""
@@ -118,14 +111,13 @@ class TuningOptions:
     crop: Annotated[int, Range(1, 4096)]
     """Edge of a training crop, px."""
     crops: Annotated[int, Range(1, 10**6)]
-    """Crops that are encoded once and learnt from."""
+    """Training crops, encoded once."""
     held_out: Share
-    """Share of the training views that is only measured on."""
+    """Share of the training views that is held out to measure on."""
     halves: Annotated[float, Range(0, 100)] = 0.35
-    """The models that render what it learns from are trained for this share of the steps that the run has taken. The
-    default: runs older than this option."""
+    """Share of the run's steps so far that the models of half of the views train. The default: older runs."""
     strengths: Annotated[list[float], Range(0, 1)]
-    """Least and greatest of those that the model will be called with."""
+    """Least and greatest strength of the run's calls."""
     prompt: str
     seconds: Seconds
     """Learning ends after this time; 0: never. A run cut short by it cannot be repeated bit for bit."""
@@ -142,7 +134,7 @@ class TuningOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RestorerOptions(DiffusionOptions):
-    """Of a restorer by image-to-image."""
+    """Options of a restorer by image-to-image."""
 
     tuning: TuningOptions
 

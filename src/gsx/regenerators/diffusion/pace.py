@@ -1,32 +1,31 @@
-"""How far long work is."""
+"""Progress of long work in the log."""
 
 import logging
 import time
 
 logger = logging.getLogger(__name__)
 
-PATIENCE = 10.0
-"""Seconds between two lines of progress."""
+LOG_SECONDS = 10.0  # between two lines of progress
 
 
 class Pace:
-    """Says how far a batch of work is, and how long it will take."""
+    """Progress of a batch of work, with an estimate of the time that is left."""
 
-    def __init__(self, name: str, whole: int) -> None:
-        self.name, self.whole, self.done = name, whole, 0
-        self.begun = self.told = time.perf_counter()
+    def __init__(self, name: str, total: int) -> None:
+        self.name, self.total, self.done = name, total, 0
+        self.start = self.logged = time.perf_counter()
 
     @property
     def seconds(self) -> float:
-        """Since the work began."""
-        return time.perf_counter() - self.begun
+        """Seconds since the work began."""
+        return time.perf_counter() - self.start
 
-    def more(self, count: int) -> None:
-        """So many more are done."""
+    def advance(self, count: int) -> None:
+        """Count finished work, and log it from time to time."""
         self.done += count
         now = time.perf_counter()
-        if now - self.told > PATIENCE and self.done < self.whole:
-            each = (now - self.begun) / self.done
-            left = each * (self.whole - self.done)
-            logger.info("%s: %d of %d, %.1f s each, %.0f s left", self.name, self.done, self.whole, each, left)
-            self.told = now
+        if now - self.logged > LOG_SECONDS and self.done < self.total:
+            each = (now - self.start) / self.done
+            left = each * (self.total - self.done)
+            logger.info("%s: %d of %d, %.1f s each, %.0f s left", self.name, self.done, self.total, each, left)
+            self.logged = now

@@ -1,10 +1,9 @@
 """Diffusion models as regenerators: batches under a budget, sizes that fit, results kept for later runs."""
 
-import hashlib
 import logging
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, astuple, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,39 +25,24 @@ from gsx.regenerators.diffusion.model_specs import Batch, ModelSpec, spec_of
 from gsx.regenerators.diffusion.models import (
     PACKAGES,
     code_stamp,
+    find_model,
     fingerprint,
-    located,
     number_type,
-    opened,
+    open_pipeline,
     place,
 )
 from gsx.regenerators.diffusion.options import DiffusionOptions, PipelineOptions, RestorerOptions
 from gsx.regenerators.diffusion.pace import Pace
-from gsx.regenerators.diffusion.sizes import enlarged, grown
-from gsx.regenerators.diffusion.tuning import Tuned, bytes_of, tuned
+from gsx.regenerators.diffusion.sizes import padded_to
+from gsx.regenerators.diffusion.tuning import Tuning
 
 logger = logging.getLogger(__name__)
 
-PICTURES = "diffusion_pictures"
-"""Kind of the results in the cache."""
+PICTURES = "diffusion_pictures"  # folder of the cache
 MEMORY = ("allocate memory", "out of memory")
 """Words of errors that smaller batches may avoid."""
 IRRELEVANT = ("download", "offload", "cached", "model", "revision")
-"""Options that do not change results; what the model is says its fingerprint."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PaddedImage:
-    """A picture as the model takes it."""
-
-    number: int
-    """Of its request."""
-    image: Float[Tensor, "3 H W"]
-    inside: Window
-    """Where in it the given picture is."""
-    request: Request
-    reference: Float[Tensor, "3 H W"] | None
-    """The photograph of its training view, where the model is shown it."""
+"""Options that do not change results; the fingerprint stands for the model."""
 
 
 class Diffusion:
@@ -69,10 +53,10 @@ class Diffusion:
         self.folder: Path | None = None
         self.pipe: Any = None
         self.identity = ""
-        """Of everything but pictures, seeds, prompts and strengths that decides on a result."""
+        """Digest of everything that decides on a result but pictures, seeds, prompts and strengths."""
 
     def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
-        """The packages and the model are there, the scales can be reached: all that can be known before training."""
+        """Raise ConfigError or InputError if a package or the model is missing, or a scale cannot be reached."""
         for scale in scales:
             rounds_to(scale, self.spec, self.options)
         tuning = self.options.tuning.steps if isinstance(self.options, RestorerOptions) else 0
@@ -83,81 +67,98 @@ class Diffusion:
                 f"regenerator {self.options.name} needs at least 2 training views to be tuned, there is {len(views)}: "
                 "choose regenerator/restore=sdxl_turbo_raw"
             )
-        self.folder = located(self.options, self.spec)
+        self.folder = find_model(self.options, self.spec)
 
     def prepare(self, context: RegeneratorContext) -> dict[str, float]:
-        """Opens the pipeline, and tune it to the scene if it is to be; once per run.
-
-        Raises:
-            TrainingError: it cannot be loaded or does not fit into memory; the run keeps its checkpoint.
-        """
+        """Open the pipeline once per run, and tune it if the options say so; TrainingError: it cannot be loaded."""
         if self.pipe is not None:
             return {}
-        begun = time.perf_counter()
-        options = self.options
-        folder = self.folder or located(options, self.spec)
+        start, options = time.perf_counter(), self.options
+        folder = self.folder or find_model(options, self.spec)
         files = fingerprint(folder, options, self.spec)
         dtype = number_type(options, context.device)
-        pipe = opened(folder, options, self.spec, dtype)
-        found = Tuned()
+        pipe = open_pipeline(folder, options, self.spec, dtype)
+        adapter, metrics = "", dict[str, float]()
         try:
             if isinstance(options, RestorerOptions) and options.tuning.steps:
-                found = tuned(pipe, options, self.spec, context, files)
+                adapter, metrics = Tuning(pipe, options, self.spec, context, files).merged()
             place(pipe, options, context.device)
         except (RuntimeError, ValueError) as error:
             raise TrainingError(
                 f"regenerator {options.name} cannot be made ready ({type(error).__name__}: {error}): if memory is "
                 f"short, set {self.spec.where}.offload=model or a smaller dtype"
             ) from error
-        telling = {key: value for key, value in asdict(options).items() if key not in IRRELEVANT}
+        deciding = {key: value for key, value in asdict(options).items() if key not in IRRELEVANT}
         machine = (code_stamp(), *machine_stamp(context.device), str(dtype))
-        self.identity = content_key(files, found.digest, telling, machine)
+        self.identity = content_key(files, adapter, deciding, machine)
         self.pipe = pipe
-        logger.info("%s is ready after %.0f s: %s", options.name, time.perf_counter() - begun, folder)
-        return found.figures
+        logger.info("%s is ready after %.0f s: %s", options.name, time.perf_counter() - start, folder)
+        return metrics
 
     @torch.no_grad()
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
-        """Each picture, in order, in steps of 1/255, as it is kept; what is not finite is given back as it is."""
+        """Return each picture in steps of 1/255, as the cache keeps it; results with NaN or inf stay as they are."""
         images = {number: request.image.cpu().float() for number, request in enumerate(requests)}
         rounds = [rounds_to(request.scale, self.spec, self.options) for request in requests]
         for turn in range(max(rounds, default=0)):
-            asked = {n: replace(r, image=images[n]) for n, r in enumerate(requests) if rounds[n] > turn}
-            images |= self.redrawn(asked, turn)
+            due = {n: replace(r, image=images[n]) for n, r in enumerate(requests) if rounds[n] > turn}
+            images |= self.redrawn(due, turn)
         return [images[number] for number in range(len(requests))]
 
-    def redrawn(self, asked: Mapping[int, Request], turn: int) -> dict[int, Float[Tensor, "3 H W"]]:
-        """Some of the pictures after one application more."""
-        spec, progress = self.spec, Pace(self.options.name, len(asked))
-        padded = []
-        for number, request in asked.items():
-            image, inside = grown(request.image, spec.multiple, spec.least)
-            photo = photograph(request, image) if spec.reference else None
-            padded.append(PaddedImage(number=number, image=image, inside=inside, request=request, reference=photo))
-        out: dict[int, Tensor] = {}
-        for together in batches(padded, self.options.batch_pixels // spec.factor**2):
-            for part, result in zip(together, self.remembered(together, turn), strict=True):
-                out[part.number] = enlarged(part.inside, spec.factor).cut(result)
-            progress.more(len(together))
+    def redrawn(self, requests: Mapping[int, Request], turn: int) -> dict[int, Float[Tensor, "3 H W"]]:
+        """Apply the model once to pictures by number."""
+        spec, progress, out = self.spec, Pace(self.options.name, len(requests)), dict[int, Tensor]()
+        for group in self.batches(requests):
+            numbers, images, windows = zip(*group, strict=True)
+            photos = [photograph(requests[number], images[0]) for number in numbers] if spec.reference else []
+            batch = Batch(
+                images=torch.stack(images),
+                prompts=[requests[number].prompt for number in numbers],
+                seeds=[requests[number].seed for number in numbers],
+                strength=requests[numbers[0]].strength,
+                references=torch.stack(photos) if photos else None,
+            )
+            for number, inside, result in zip(numbers, windows, self.remembered(batch, turn), strict=True):
+                out[number] = Window(*(spec.factor * side for side in astuple(inside))).cut(result)
+            progress.advance(len(batch))
         return out
 
-    def remembered(self, together: Sequence[PaddedImage], turn: int) -> list[Float[Tensor, "3 H W"]]:
-        """Results of a batch, from the cache if it holds this batch: what is drawn may depend on the company."""
-        contents = [content_of(part) for part in together]
-        paths = [self.path(contents, number, turn) for number in range(len(together))]
+    def batches(self, requests: Mapping[int, Request]) -> Iterator[list[tuple[int, Tensor, Window]]]:
+        """Yield (number, padded picture, window of the original in it) of requests with one size and strength."""
+        alike: dict[tuple[object, ...], list[tuple[int, Tensor, Window]]] = {}
+        for number, request in requests.items():
+            image, inside = padded_to(request.image, self.spec.multiple, self.spec.least)
+            alike.setdefault((*image.shape, request.strength), []).append((number, image, inside))
+        for group in alike.values():
+            pixels = group[0][1][0].numel() * self.spec.factor**2  # of a result
+            count = max(1, self.options.batch_pixels // pixels)
+            yield from (group[first : first + count] for first in range(0, len(group), count))
+
+    def remembered(self, batch: Batch, turn: int) -> list[Float[Tensor, "3 H W"]]:
+        """Return results of a batch, from the cache if it holds this very batch: a result may depend on the others."""
+        contents = batch.contents()
+        keys = [content_key(self.identity, contents, number, turn) for number in range(len(batch))]
+        paths = [cache_folder(PICTURES, key) / "picture.png" for key in keys]
         kept = [read_cached_image(path) for path in paths] if self.options.cached else []
         if kept and all(result is not None for result in kept):
             return [result.float() / 255 for result in kept if result is not None]
-        results = [rounded(result) for result in self.called(batch_of(together))]
-        for path, result in zip(paths, results, strict=True):
-            if self.options.cached and bool(torch.isfinite(result).all()):
-                cache_image(path, result)
+        results = list(self.called(batch))
+        for index, result in enumerate(results):
+            if bool(torch.isfinite(result).all()):
+                results[index] = to_uint8(result.clamp(0, 1)).float() / 255
+                if self.options.cached:
+                    cache_image(paths[index], results[index])
         return results
 
     def called(self, batch: Batch) -> Float[Tensor, "B 3 H W"]:
-        """Results of one call, in halves where memory does not suffice."""
+        """Call the pipeline, on half of the pictures where memory is short; TrainingError: it fails on one picture."""
         try:
-            return self.of_the_right_size(batch, self.spec.call(self.pipe, batch, self.options).detach().cpu().float())
+            results: Tensor = self.spec.call(self.pipe, batch, self.options).detach().cpu().float()
+            count, channels, height, width = batch.images.shape
+            expected = (count, channels, height * self.spec.factor, width * self.spec.factor)
+            if tuple(results.shape) != expected:
+                raise ValueError(f"its results are {tuple(results.shape)} and should be {expected}")
+            return results
         except Exception as error:  # whatever a library or a custom pipeline raises, the run must end in one sentence
             if not any(words in str(error).lower() for words in MEMORY):
                 raise TrainingError(
@@ -173,26 +174,14 @@ class Diffusion:
         half = len(batch) // 2
         return torch.cat([self.called(batch.part(0, half)), self.called(batch.part(half, len(batch)))])
 
-    def of_the_right_size(self, batch: Batch, results: Tensor) -> Float[Tensor, "B 3 H W"]:
-        """The results, or ValueError if the pipeline has made something else of its pictures."""
-        count, channels, height, width = batch.images.shape
-        expected = (count, channels, height * self.spec.factor, width * self.spec.factor)
-        if tuple(results.shape) != expected:
-            raise ValueError(f"its results are {tuple(results.shape)} and should be {expected}")
-        return results
-
-    def path(self, contents: Sequence[str], number: int, turn: int) -> Path:
-        """Where the result of one picture of a batch is kept."""
-        return cache_folder(PICTURES, content_key(self.identity, contents, number, turn)) / "picture.png"
-
 
 def any_pipeline(options: PipelineOptions) -> Diffusion:
-    """One that its options alone describe."""
+    """Return the regenerator of a pipeline that its options describe."""
     return Diffusion(spec_of(options), options)
 
 
 def rounds_to(scale: int, spec: ModelSpec, options: DiffusionOptions) -> int:
-    """How often a model is applied to reach a scale."""
+    """Return how many applications of a model reach a scale; ConfigError: none do."""
     if spec.factor == 1:
         refuse_enlarging(options.name, [scale])
         return 1
@@ -205,45 +194,7 @@ def rounds_to(scale: int, spec: ModelSpec, options: DiffusionOptions) -> int:
     return rounds
 
 
-def batches(padded: Sequence[PaddedImage], pixels: int) -> list[list[PaddedImage]]:
-    """Pictures of one size and strength together, so many pixels at a time, one picture at least."""
-    alike: dict[tuple[object, ...], list[PaddedImage]] = {}
-    for part in padded:
-        alike.setdefault((*part.image.shape, part.request.strength), []).append(part)
-    out = []
-    for group in alike.values():
-        count = max(1, pixels // group[0].image[0].numel())
-        out += [group[first : first + count] for first in range(0, len(group), count)]
-    return out
-
-
 def photograph(request: Request, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """That of the training view which a picture was made from, at the picture's size."""
+    """Return the photograph of a request's training view at the size of its picture."""
     whole = to_uint8(request.view.image())
     return resize(whole, image.shape[2], image.shape[1], "bicubic").float() / 255
-
-
-def batch_of(together: Sequence[PaddedImage]) -> Batch:
-    """One call's worth."""
-    references = [part.reference for part in together if part.reference is not None]
-    return Batch(
-        references=torch.stack(references) if references else None,
-        images=torch.stack([part.image for part in together]),
-        prompts=[part.request.prompt for part in together],
-        seeds=[part.request.seed for part in together],
-        strength=together[0].request.strength,
-    )
-
-
-def content_of(part: PaddedImage) -> str:
-    """Of all that a picture's result depends on, but for its company."""
-    request, exact = part.request, hashlib.sha256()
-    for picture in (part.image, part.reference):
-        if picture is not None:
-            exact.update(bytes_of(picture))
-    return content_key(exact.hexdigest(), request.seed, request.strength, request.prompt)
-
-
-def rounded(result: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """In steps of 1/255, if it is finite."""
-    return to_uint8(result.clamp(0, 1)).float() / 255 if bool(torch.isfinite(result).all()) else result

@@ -36,16 +36,13 @@ ALPHABET = "".join(GLYPHS)
 
 
 def strokes(glyph: str) -> list[tuple[float, float, float, float]]:
-    """The straight lines (x0, y0, x1, y1) of one entry of GLYPHS."""
-    lines = []
-    for polyline in filter(None, glyph.split("|")):
-        points = [(float(point[0]), float(point[1])) for point in polyline.split()]
-        lines += [(*a, *b) for a, b in pairwise(points)]
-    return lines
+    """Return the straight lines (x0, y0, x1, y1) of one entry of GLYPHS."""
+    polylines = [[(float(x), float(y)) for x, y in polyline.split()] for polyline in glyph.split("|")]
+    return [(*a, *b) for points in polylines for a, b in pairwise(points)]
 
 
 def stroke_table() -> Float[Tensor, "lines glyphs 4"]:
-    """The lines of every letter, padded with far ones to the largest count."""
+    """Return the lines of every letter, padded with far ones to the largest count."""
     table = [strokes(glyph) for glyph in GLYPHS.values()]
     most = max(len(lines) for lines in table)
     return torch.tensor([lines + [(FAR,) * 4] * (most - len(lines)) for lines in table]).permute(1, 0, 2).contiguous()
@@ -57,37 +54,36 @@ class Line:
 
     text: str
     size: float
-    """Height of its letters, scene units."""
+    """Height of the letters, scene units."""
     centre: float
-    """Height of its middle on the panel, scene units."""
+    """Height of the line's middle on the panel, scene units."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lettering:
-    """Lines of text as tables, so that every point of a panel is looked up at once."""
+    """Lines of text as tables, which look up all points of a panel at once."""
 
     strokes: Float[Tensor, "lines glyphs 4"]
     letters: Int[Tensor, "rows columns"]
-    """Index into ALPHABET; blanks fill short lines, and at least one ends each, met before the first letter too."""
+    """Indices into ALPHABET; blanks fill short lines, and at least one ends each: places before a line wrap to it."""
     unit: Float[Tensor, "rows"]
     """Scene units per grid unit."""
     left: Float[Tensor, "rows"]
     bottom: Float[Tensor, "rows"]
 
     def ink(self, u: Float[Tensor, "points"], v: Float[Tensor, "points"]) -> Bool[Tensor, "points"]:
-        """Whether panel points (u to the right, v up, from the panel's middle, scene units) lie on a letter."""
+        """Return which panel points (u to the right, v up, from the middle, scene units) lie on a letter."""
         result = torch.zeros_like(u, dtype=torch.bool)
         for row in range(len(self.unit)):
             x, y = (u - self.left[row]) / self.unit[row], (v - self.bottom[row]) / self.unit[row]
             inside = (y > -STROKE) & (y < HEIGHT + STROKE) & (x > -STROKE) & (x < (self.letters.shape[1] - 1) * ADVANCE)
             chosen = inside.nonzero()[:, 0]
             if len(chosen):
-                on = self.row_ink(row, x.index_select(0, chosen), y.index_select(0, chosen))
-                result[chosen] = result[chosen] | on
+                result[chosen] |= self.row_ink(row, x.index_select(0, chosen), y.index_select(0, chosen))
         return result
 
     def row_ink(self, row: int, x: Float[Tensor, "points"], y: Float[Tensor, "points"]) -> Bool[Tensor, "points"]:
-        """Whether grid points of one row of text lie on a letter."""
+        """Return which grid points of one row of text lie on a letter."""
         place = ((x + (ADVANCE - WIDTH) / 2) / ADVANCE).floor()
         letter = self.letters[row].index_select(0, place.long() % self.letters.shape[1])
         x = x - place * ADVANCE
@@ -100,7 +96,7 @@ class Lettering:
 def squared_distance(
     x: Float[Tensor, "points"], y: Float[Tensor, "points"], line: Float[Tensor, "4 points"]
 ) -> Float[Tensor, "points"]:
-    """Squared distance from points to straight lines (x0, y0, x1, y1)."""
+    """Return the squared distance from points to straight lines (x0, y0, x1, y1)."""
     run, rise = line[2] - line[0], line[3] - line[1]
     x, y = x - line[0], y - line[1]
     length = (run * run + rise * rise).clamp(min=1e-6)  # a dot is a line of no length
@@ -110,11 +106,7 @@ def squared_distance(
 
 
 def typeset(lines: Sequence[Line]) -> Lettering:
-    """Tables for lines of text.
-
-    Raises:
-        KeyError: a character is not in the font.
-    """
+    """Tabulate lines of text; KeyError: a character is not in the font."""
     index = {character: place for place, character in enumerate(ALPHABET)}
     columns = max(len(line.text) for line in lines)
     unit = torch.tensor([line.size / HEIGHT for line in lines])

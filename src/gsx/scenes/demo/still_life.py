@@ -1,11 +1,11 @@
 """The arrangement: a garden with a brick wall, a potted tree, a reading chart, a crate, a tin and two balls.
 
-Light does not depend on where it is seen from (but for one mild highlight on the beach ball): a sun with soft
-shadows, an even sky, and darkening where things stand close together.
+Light does not depend on the direction of view (but for one mild highlight on the beach ball): a sun with soft shadows,
+an even sky, and darkening where things stand close together.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -13,17 +13,7 @@ from torch import Tensor
 
 from gsx.core.shapes import Float, Int
 from gsx.scenes.demo import textures
-from gsx.scenes.demo.solids import (  # fmt: skip
-    Solid,
-    box,
-    cylinder,
-    dot,
-    double,
-    neighbours,
-    normalise,
-    smoothstep,
-    sphere,
-)
+from gsx.scenes.demo.solids import Solid, box, cylinder, dot, double, neighbours, normalise, smoothstep, sphere
 from gsx.scenes.demo.textures import Kit, make_kit
 
 Texture = Callable[[Tensor, Tensor, Kit], Tensor]
@@ -35,13 +25,10 @@ PENUMBRA = 0.12  # a shadow is full where the light would cross this much of a s
 CONTACT_REACH = 0.30  # surfaces nearer than this to another solid are darkened, scene units
 CONTACT_DEPTH = 0.45  # by this fraction where they touch
 HIGHLIGHT = 0.35  # strength of the highlight on the beach ball
-SEED = 20  # of the textures' noise: the picture everybody sees
-
-SIGN_HALF = (0.52, 0.35)
-CRATE, POT_HEIGHT, TIN_RADIUS = 0.52, 0.40, 0.11
+SEED = 20  # of the textures' noise: the published picture
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Thing:
     """A solid, its texture, and the other solids near enough to darken it or to stand in its light."""
 
@@ -54,57 +41,41 @@ class Thing:
 
 @dataclass(frozen=True, eq=False)
 class StillLife:
-    """Everything there is to see."""
+    """All things of a scene."""
 
     things: tuple[Thing, ...]
     kit: Kit
 
     @property
     def solids(self) -> tuple[Solid, ...]:
-        """The solids alone; their place is their number in a trace."""
+        """Return the solids; their index is their number in a trace."""
         return tuple(thing.solid for thing in self.things)
 
     @property
     def standing(self) -> tuple[Solid, ...]:
-        """The solids near enough to the ground to darken it."""
+        """Return the solids near enough to the ground to darken it."""
         return tuple(solid for solid in self.solids if float(solid.centre[2] - solid.half[2]) < CONTACT_REACH)
 
 
-def furniture() -> list[tuple[Solid, Texture, float]]:
-    """The solids with their textures and highlights; z = 0 is the ground, units are about metres."""
+def furniture() -> list[Thing]:
+    """Return the things of the garden; z = 0 is the ground, units are about metres."""
     return [
-        (box("wall", (-0.10, 0.85, 0.42), (1.90, 0.26, 0.84), 6.0), textures.bricks, 0.0),
-        (box("coping", (-0.10, 0.85, 0.875), (1.98, 0.34, 0.07), 6.0), textures.coping, 0.0),
-        (
-            cylinder("pot", (-0.95, 0.05, POT_HEIGHT / 2), 0.25, POT_HEIGHT),
-            partial(textures.pot, half_height=POT_HEIGHT / 2),
-            0.0,
-        ),
-        (cylinder("trunk", (-0.95, 0.05, 0.60), 0.045, 0.46), textures.bark, 0.0),
-        (sphere("crown", (-0.95, 0.05, 1.12), 0.40), textures.foliage, 0.0),
-        (
-            box("board", (0.78, 0.08, 0.80), (2 * SIGN_HALF[0], 0.05, 2 * SIGN_HALF[1]), 24.0),
-            partial(textures.sign, half=SIGN_HALF),
-            0.0,
-        ),
-        (box("post", (0.78, 0.08, 0.225), (0.08, 0.08, 0.45), 24.0), textures.post, 0.0),
-        (
-            box("crate", (-0.22, -0.55, CRATE / 2), (CRATE, CRATE, CRATE), -28.0),
-            partial(textures.crate, half=CRATE / 2),
-            0.0,
-        ),
-        (
-            cylinder("tin", (-0.25, -0.50, CRATE + 0.13), TIN_RADIUS, 0.26, -75.0),
-            partial(textures.tin, radius=TIN_RADIUS),
-            0.0,
-        ),
-        (sphere("beach ball", (0.52, -0.80, 0.23), 0.23, 20.0), textures.beach_ball, HIGHLIGHT),
-        (sphere("marble", (0.35, 1.38, 0.20), 0.20), textures.marble, 0.0),
+        Thing(box("wall", (-0.10, 0.85, 0.42), (1.90, 0.26, 0.84), 6.0), textures.bricks),
+        Thing(box("coping", (-0.10, 0.85, 0.875), (1.98, 0.34, 0.07), 6.0), textures.coping),
+        Thing(cylinder("pot", (-0.95, 0.05, 0.20), 0.25, 0.40), partial(textures.pot, half_height=0.20)),
+        Thing(cylinder("trunk", (-0.95, 0.05, 0.60), 0.045, 0.46), textures.bark),
+        Thing(sphere("crown", (-0.95, 0.05, 1.12), 0.40), textures.foliage),
+        Thing(box("board", (0.78, 0.08, 0.80), (1.04, 0.05, 0.70), 24.0), partial(textures.sign, half=(0.52, 0.35))),
+        Thing(box("post", (0.78, 0.08, 0.225), (0.08, 0.08, 0.45), 24.0), textures.post),
+        Thing(box("crate", (-0.22, -0.55, 0.26), (0.52, 0.52, 0.52), -28.0), partial(textures.crate, half=0.26)),
+        Thing(cylinder("tin", (-0.25, -0.50, 0.65), 0.11, 0.26, -75.0), partial(textures.tin, radius=0.11)),
+        Thing(sphere("beach ball", (0.52, -0.80, 0.23), 0.23, 20.0), textures.beach_ball, HIGHLIGHT),
+        Thing(sphere("marble", (0.35, 1.38, 0.20), 0.20), textures.marble),
     ]
 
 
-def in_the_light(solid: Solid, others: list[Solid]) -> tuple[Solid, ...]:
-    """The other solids whose bounding sphere lies on the way from this one's to the sun."""
+def shading(solid: Solid, others: Sequence[Solid]) -> tuple[Solid, ...]:
+    """Return the other solids whose bounding sphere lies between this one's and the sun."""
     sun = normalise(double(SUN))
     found = []
     for other in others:
@@ -115,28 +86,23 @@ def in_the_light(solid: Solid, others: list[Solid]) -> tuple[Solid, ...]:
     return tuple(found)
 
 
-def arranged(things: Sequence[tuple[Solid, Texture, float]], kit: Kit) -> StillLife:
-    """Solids with textures and highlights as things that darken each other."""
-    solids = [solid for solid, _, _ in things]
-    return StillLife(
-        tuple(
-            Thing(
-                solid=solid, texture=texture, shine=shine, near=tuple(neighbours(solid, solids, CONTACT_REACH)),
-                shading=in_the_light(solid, solids),
-            )
-            for solid, texture, shine in things
-        ),
-        kit,
-    )  # fmt: skip
+def arrange(things: Sequence[Thing], kit: Kit) -> StillLife:
+    """Return a scene of things that darken each other."""
+    solids = [thing.solid for thing in things]
+    lit = (
+        replace(thing, near=neighbours(solid, solids, CONTACT_REACH), shading=shading(solid, solids))
+        for thing, solid in zip(things, solids, strict=True)
+    )
+    return StillLife(tuple(lit), kit)
 
 
 def make_still_life() -> StillLife:
-    """The arrangement with its tables."""
-    return arranged(furniture(), make_kit(torch.Generator().manual_seed(SEED)))
+    """Arrange the garden with its textures."""
+    return arrange(furniture(), make_kit(torch.Generator().manual_seed(SEED)))
 
 
 def sunlight(points: Float[Tensor, "3 points"], shading: tuple[Solid, ...]) -> Float[Tensor, "points"]:
-    """The part of the sun seen from world points: each solid takes away more the more of it the light would cross."""
+    """Return the part of the sun that reaches world points: a solid takes more, the more of it the light crosses."""
     frame = sun_frame()
     across, down = (dot(axis[:, None], points) for axis in frame[:2].float())
     light = torch.ones_like(across)
@@ -151,19 +117,19 @@ def sunlight(points: Float[Tensor, "3 points"], shading: tuple[Solid, ...]) -> F
 
 
 def within(x: Float[Tensor, "points"], y: Float[Tensor, "points"], radius: float) -> Int[Tensor, "chosen"]:
-    """Numbers of the points in a circle around the origin."""
+    """Return the numbers of the points in a circle around the origin."""
     return (x * x + y * y < radius**2).nonzero()[:, 0]
 
 
 def sun_frame() -> Float[Tensor, "3 3"]:
-    """Two axes across the sunlight and one towards the sun, as rows, float64."""
+    """Return two axes across the sunlight and one towards the sun, as rows, float64."""
     sun = normalise(double(SUN))
     across = normalise(torch.linalg.cross(sun, double((0.0, 0.0, 1.0))))
     return torch.stack([across, torch.linalg.cross(sun, across), sun])
 
 
 def openness(points: Float[Tensor, "3 points"], near: tuple[Solid, ...]) -> Float[Tensor, "points"]:
-    """1 in the open, less where world points lie close to other solids."""
+    """Return 1 in the open, less where world points lie close to other solids."""
     light = torch.ones_like(points[0])
     for solid in near:
         x, y, _ = solid.centre.tolist()
@@ -175,7 +141,7 @@ def openness(points: Float[Tensor, "3 points"], near: tuple[Solid, ...]) -> Floa
 
 
 def contact(distance: Float[Tensor, "points"]) -> Float[Tensor, "points"]:
-    """Darkening at a distance from something large, smooth and 1 beyond CONTACT_REACH."""
+    """Return the darkening at a distance from something large, smooth and 1 beyond CONTACT_REACH."""
     closeness = (1.0 - distance / CONTACT_REACH).clamp(0.0, 1.0)
     return 1.0 - CONTACT_DEPTH * closeness * closeness
 
@@ -183,7 +149,7 @@ def contact(distance: Float[Tensor, "points"]) -> Float[Tensor, "points"]:
 def thing_colour(
     thing: Thing, kit: Kit, points: Float[Tensor, "3 points"], directions: Float[Tensor, "3 points"]
 ) -> Float[Tensor, "3 points"]:
-    """Display colour of surface points (world) of one thing, seen along unit directions."""
+    """Return the display colour of surface points (world) of one thing, viewed along unit directions."""
     local = thing.solid.local(points)
     normal = thing.solid.normal(local)
     albedo = thing.texture(local, normal, kit)
@@ -199,7 +165,7 @@ def thing_colour(
 
 
 def ground_colour(life: StillLife, points: Float[Tensor, "3 points"]) -> Float[Tensor, "3 points"]:
-    """Display colour of ground points; light and shadow give way to the haze far out."""
+    """Return the display colour of ground points; light and shadow give way to the haze far out."""
     facing = float(sun_frame()[2, 2])
     shade = SUNLIGHT * facing * sunlight(points, life.solids) + SKYLIGHT * openness(points, life.standing)
     radius = (points[0] * points[0] + points[1] * points[1]).sqrt()
@@ -208,5 +174,5 @@ def ground_colour(life: StillLife, points: Float[Tensor, "3 points"]) -> Float[T
 
 
 def sky_colour(life: StillLife, points: Float[Tensor, "3 points"]) -> Float[Tensor, "3 points"]:
-    """Display colour of points on the dome."""
+    """Return the display colour of points on the dome."""
     return textures.sky(points / DOME, life.kit)

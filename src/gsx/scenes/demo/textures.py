@@ -1,8 +1,8 @@
-"""Procedural surface colours: each is a function of position on a solid, with detail at every scale down to a
-few thousandths of a scene unit and nothing filtered away, so that a closer look always finds more.
+"""Procedural surface colours: functions of position on a solid with unfiltered detail at every scale down to a few
+thousandths of a scene unit, so that zooming in always finds more.
 
-Coordinates are the solid's own, in scene units; colours are display RGB. Contrasts are the tunable part: the finest
-grain stays weak, since training pictures cannot resolve it and would only see it as noise.
+Arguments `p` and `n` are positions (scene units) and normals in the solid's own axes; colours are display RGB. The
+finest grain stays weak: training pictures cannot resolve it, and it would be noise in them.
 """
 
 import math
@@ -35,21 +35,16 @@ CHART = (
     Line("THIS ONE NEEDS X2", 0.036, -0.154), Line("AND THIS ONE NEEDS X4", 0.022, -0.202),
     Line("ONLY AT X8 CAN THE LAST LINE BE READ", 0.012, -0.237),
 )  # fmt: skip
-CRATE_LABEL = (
-    Line("GSX", 0.100, 0.085),
-    Line("FRAGILE", 0.042, -0.020),
-    Line("HANDLE WITH CARE", 0.019, -0.075),
-)
-TIN_LABEL = (
-    Line("TEA", 0.075, 0.025),
-    Line("FINEST LEAVES", 0.0155, -0.040),
-    Line("NET WEIGHT 250 G", 0.008, -0.065),
-)
+CRATE_LABEL = Line("GSX", 0.100, 0.085), Line("FRAGILE", 0.042, -0.020), Line("HANDLE WITH CARE", 0.019, -0.075)
+TIN_LABEL = Line("TEA", 0.075, 0.025), Line("FINEST LEAVES", 0.0155, -0.040), Line("NET WEIGHT 250 G", 0.008, -0.065)
+
+Vectors = Float[Tensor, "3 points"]
+Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Kit:
-    """What textures draw on."""
+    """Noise and lettering tables of all textures."""
 
     noise: Noise
     chart: Lettering
@@ -58,57 +53,53 @@ class Kit:
 
 
 def make_kit(generator: torch.Generator) -> Kit:
-    """Noise and lettering tables."""
+    """Draw the noise and typeset the lettering."""
     return Kit(make_noise(generator), typeset(CHART), typeset(CRATE_LABEL), typeset(TIN_LABEL))
 
 
-def rgb(colour: tuple[float, float, float]) -> Float[Tensor, "3 1"]:
-    """A colour that meets a [3, points] tensor."""
+def rgb(colour: Colour) -> Float[Tensor, "3 1"]:
+    """Return a colour that broadcasts over [3, points]."""
     return torch.tensor(colour)[:, None]
 
 
-def plain(
-    p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit, colour: tuple[float, float, float]
-) -> Float[Tensor, "3 points"]:
-    """One colour."""
+def plain(p: Vectors, n: Vectors, kit: Kit, colour: Colour) -> Vectors:
+    """Draw one colour."""
     return rgb(colour).expand_as(p)
 
 
-def between(a: tuple[float, float, float], b: tuple[float, float, float], weight: Tensor) -> Float[Tensor, "3 points"]:
-    """From colour `a` at weight 0 to `b` at weight 1."""
+def between(a: Colour, b: Colour, weight: Tensor) -> Vectors:
+    """Blend from colour `a` at weight 0 to `b` at weight 1."""
     return blend(rgb(a), rgb(b), weight)
 
 
-def cover(under: Float[Tensor, "3 points"], colour: tuple[float, float, float], weight: Tensor) -> Tensor:
-    """A colour laid over another with the given opacity."""
+def cover(under: Vectors, colour: Colour, weight: Tensor) -> Tensor:
+    """Lay a colour over another with this opacity."""
     return blend(under, rgb(colour), weight.to(under))
 
 
-def face_coordinates(
-    p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"]
-) -> tuple[Float[Tensor, "points"], Float[Tensor, "points"]]:
-    """(u, v) on the face of a box as seen from outside: u to the right, v up; on top and bottom x and y."""
+def face_coordinates(p: Vectors, n: Vectors) -> tuple[Float[Tensor, "points"], Float[Tensor, "points"]]:
+    """Return (u, v) on the face of a box from outside: u to the right, v up; on top and bottom x and y."""
     lid = n[2].abs()
     return n[0] * p[1] - n[1] * p[0] + lid * p[0], (1.0 - lid) * p[2] + lid * p[1]
 
 
 def parity(x: Tensor) -> Tensor:
-    """0 for even, 1 for odd whole numbers given as floats."""
+    """Return 0 for even, 1 for odd whole numbers, which are floats."""
     return x - 2.0 * (x * 0.5).floor()
 
 
 def edge_distance(x: Tensor, size: float) -> Tensor:
-    """Distance to the nearest multiple of 1, times `size`."""
+    """Return the distance to the nearest multiple of 1, times `size`."""
     return (0.5 - (x - x.floor() - 0.5).abs()) * size
 
 
 def mineral(kit: Kit, u: Tensor, v: Tensor, size: float) -> Tensor:
-    """A brightness factor around 1: grain of five octaves from `size` down."""
+    """Return a brightness factor around 1: grain of five octaves from `size` down."""
     return 1.0 + GRAIN * kit.noise.grain(u / size, v / size, 5)
 
 
-def bricks(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """Bricks in running bond, pale mortar."""
+def bricks(p: Vectors, n: Vectors, kit: Kit) -> Vectors:
+    """Draw bricks in running bond, pale mortar."""
     u, v = face_coordinates(p, n)
     row = (v / BRICK[1]).floor()
     along = u / BRICK[0] + 0.5 * parity(row)
@@ -121,26 +112,24 @@ def bricks(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit)
     return blend(rgb((0.75, 0.72, 0.66)), worn, smoothstep((edge - JOINT) / 0.002 + 0.5)) * grain
 
 
-def coping(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """Sandstone slabs."""
+def coping(p: Vectors, n: Vectors, kit: Kit) -> Vectors:
+    """Draw sandstone slabs."""
     u, v = face_coordinates(p, n)
     stone = between((0.76, 0.69, 0.56), (0.86, 0.81, 0.70), 0.5 + 0.5 * kit.noise.plane(u * 3.0, v * 9.0))
     joint = smoothstep(edge_distance(u / 0.47 + 0.5, 0.47) / 0.005)
     return stone * mineral(kit, u, v, 0.06) * (0.6 + 0.4 * joint)
 
 
-def wood(kit: Kit, along: Tensor, across: Tensor, plank: Tensor) -> Float[Tensor, "3 points"]:
-    """Wood with fibres along one axis; `plank` makes every board another piece of timber."""
+def wood(kit: Kit, along: Tensor, across: Tensor, plank: Tensor) -> Vectors:
+    """Draw wood with fibres along one axis; `plank` makes every board another piece of timber."""
     bend = 0.012 * kit.noise.plane(along * 3.0 + 7.0 * plank, across * 5.0)
     fibre = kit.noise.grain(along * 5.0 + 31.0 * plank, (across + bend) * 75.0, 4)
     shade = 0.5 + 0.5 * kit.noise.at(plank, plank + 3.0)
     return between((0.60, 0.43, 0.25), (0.76, 0.58, 0.36), shade) * (1.0 + FIBRE * fibre)
 
 
-def crate(
-    p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit, half: float
-) -> Float[Tensor, "3 points"]:
-    """Upright planks in a frame of boards with nails, a stencilled label on the planks of the four sides."""
+def crate(p: Vectors, n: Vectors, kit: Kit, half: float) -> Vectors:
+    """Draw upright planks in a frame of boards with nails, and a stencilled label on the planks of the four sides."""
     u, v = face_coordinates(p, n)
     side = 5.0 * n[0] + 11.0 * n[1] + 17.0 * n[2]
     rim = 0.72 * half
@@ -158,13 +147,13 @@ def crate(
 
 
 def nails(u: Tensor, v: Tensor) -> Tensor:
-    """A brightness factor: dark heads of four nails around the origin."""
+    """Return a brightness factor: dark heads of four nails around the origin."""
     u, v = u.abs() - 0.018, v.abs() - 0.018
     return 0.35 + 0.65 * smoothstep(((u * u + v * v).sqrt() - 0.005) / 0.0015)
 
 
-def sign(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit, half: tuple[float, float]) -> Tensor:
-    """An enamelled reading chart on both faces of a board, with a blue rim and screws."""
+def sign(p: Vectors, n: Vectors, kit: Kit, half: tuple[float, float]) -> Tensor:
+    """Draw an enamelled reading chart on both faces of a board, with a blue rim and screws."""
     u, v = face_coordinates(p, n)
     inset = torch.minimum(half[0] - u.abs(), half[1] - v.abs())
     enamel = rgb((0.95, 0.94, 0.89)) * (1.0 + 0.25 * GRAIN * kit.noise.grain(u * 25.0, v * 25.0, 4))
@@ -177,20 +166,20 @@ def sign(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit, h
     return cover(head, (0.25, 0.25, 0.28), (from_screw < 0.010) & ((screw_u + screw_v).abs() < 0.003))
 
 
-def post(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """A squared wooden post."""
+def post(p: Vectors, n: Vectors, kit: Kit) -> Vectors:
+    """Draw a squared wooden post."""
     u, v = face_coordinates(p, n)
     return wood(kit, v, u, 2.0 * n[0] + 5.0 * n[1] + 90.0) * 0.8
 
 
-def bark(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """Ridged bark: noise stretched upwards."""
+def bark(p: Vectors, n: Vectors, kit: Kit) -> Vectors:
+    """Draw ridged bark: noise stretched upwards."""
     ridges = kit.noise.grain(angle(p[1], p[0]) * 4.0 + 50.0, p[2] * 7.0, 5, 0.8)
     return between((0.25, 0.17, 0.11), (0.47, 0.36, 0.26), 0.5 + 0.6 * ridges)
 
 
-def pot(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit, half_height: float) -> Tensor:
-    """Terracotta with turning marks, a painted zigzag band, and soil on top."""
+def pot(p: Vectors, n: Vectors, kit: Kit, half_height: float) -> Tensor:
+    """Draw terracotta with turning marks, a painted zigzag band, and soil on top."""
     around = angle(p[1], p[0]) * (14.0 / math.pi)
     clay = rgb((0.74, 0.41, 0.27)) * mineral(kit, around * 0.08, p[2], 0.05)
     clay = clay * (1.0 + 0.5 * FIBRE * kit.noise.plane(around * 0.4, p[2] * 110.0))
@@ -203,11 +192,11 @@ def pot(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit, ha
     return torch.where(inside, soil, clay * lip)
 
 
-def tin(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit, radius: float) -> Tensor:
-    """A tea tin: green label with lettering on two sides, metal rims and lid."""
+def tin(p: Vectors, n: Vectors, kit: Kit, radius: float) -> Tensor:
+    """Draw a tea tin: green label with lettering on two sides, metal rims and lid."""
     around = angle(p[1], p[0]) * radius
     quarter = radius * math.pi / 2
-    u = wrapped(around, 2.0 * quarter)
+    u = around - 2.0 * quarter * (around / (2.0 * quarter) + 0.5).floor()  # within [-quarter, quarter)
     green = rgb((0.12, 0.36, 0.27)) * (1.0 + 0.06 * kit.noise.grain(around * 60.0, p[2] * 60.0, 4))
     lettered = cover(green, (0.94, 0.88, 0.66), kit.tin_label.ink(u, p[2]))
     stripe = ((p[2].abs() - 0.092).abs() < 0.003) | ((u.abs() - 0.97 * quarter).abs() < 0.002)
@@ -217,13 +206,8 @@ def tin(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit, ra
     return torch.where((p[2].abs() > 0.105) | (n[2].abs() > 0.5), metal, label)
 
 
-def wrapped(x: Tensor, period: float) -> Tensor:
-    """`x` brought into [-period/2, period/2)."""
-    return x - period * (x / period + 0.5).floor()
-
-
-def foliage(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """Layers of leaves over dark green, the outermost last."""
+def foliage(p: Vectors, n: Vectors, kit: Kit) -> Vectors:
+    """Draw layers of leaves over dark green, the outermost last."""
     longitude, latitude = angle(n[1], n[0]), angle(n[2], (n[0] * n[0] + n[1] * n[1]).sqrt())
     colour = rgb((0.09, 0.16, 0.06)) * (1.0 + 0.2 * kit.noise.plane(longitude * 20.0, latitude * 20.0))
     for layer in range(LEAF_LAYERS):
@@ -233,10 +217,8 @@ def foliage(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit
     return colour
 
 
-def leaf_layer(
-    longitude: Tensor, latitude: Tensor, layer: float, kit: Kit
-) -> tuple[Bool[Tensor, "points"], Float[Tensor, "3 points"]]:
-    """One turned leaf per cell of rows along the parallels: where it is, and its colour there."""
+def leaf_layer(longitude: Tensor, latitude: Tensor, layer: float, kit: Kit) -> tuple[Bool[Tensor, "points"], Vectors]:
+    """Place one turned leaf in each cell of rows along the parallels; returns where leaves are, and their colour."""
     height = latitude / LEAF_ROW + 0.37 * layer
     row = height.floor()
     middle = (row + 0.5 - 0.37 * layer) * LEAF_ROW
@@ -252,13 +234,13 @@ def leaf_layer(
 
 
 def leaf_shape(along: Tensor, across: Tensor) -> Bool[Tensor, "points"]:
-    """Whether leaf coordinates lie within the outline, pointed at both ends."""
+    """Return which leaf coordinates lie within the outline, pointed at both ends."""
     x = (along / LEAF[0]).clamp(-1.0, 1.0)
     return across.abs() < LEAF[1] * (1.0 - x * x) * (1.15 - 0.3 * x)
 
 
-def leaf_colour(along: Tensor, across: Tensor, hue: Tensor) -> Float[Tensor, "3 points"]:
-    """Two halves of different brightness, a pale rib, and side veins."""
+def leaf_colour(along: Tensor, across: Tensor, hue: Tensor) -> Vectors:
+    """Draw two halves of different brightness, a pale rib, and side veins."""
     green = between((0.20, 0.37, 0.11), (0.47, 0.60, 0.24), hue)
     fold = 1.0 + 0.12 * across.sign()
     vein = smoothstep(edge_distance((along - 0.8 * across.abs()) * 11.0, 0.09) / 0.012)
@@ -267,13 +249,13 @@ def leaf_colour(along: Tensor, across: Tensor, hue: Tensor) -> Float[Tensor, "3 
 
 
 def cosine(x: Tensor) -> Tensor:
-    """cos x for |x| <= pi/2 within 1e-3, by its Taylor series: the same bits on every machine."""
+    """Return cos x for |x| <= pi/2 within 1e-3, by its Taylor series: the same bits on every machine."""
     square = x * x
     return 1.0 - square * (0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0)))
 
 
-def beach_ball(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """Six coloured gores with white seams and caps, and a fine weave."""
+def beach_ball(p: Vectors, n: Vectors, kit: Kit) -> Vectors:
+    """Draw six coloured gores with white seams and caps, and a fine weave."""
     tilted = torch.stack([n[0], 0.8 * n[1] - 0.6 * n[2], 0.6 * n[1] + 0.8 * n[2]])
     turn = angle(tilted[1], tilted[0]) * (3.0 / math.pi) + 3.0
     gore = turn.floor()
@@ -287,8 +269,8 @@ def beach_ball(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: 
     return cover(colour * (0.94 + 0.12 * weave), (0.86, 0.22, 0.18), (ring < 0.215) & (ring > 0.17))
 
 
-def marble(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """Pale stone with veins of several sizes running through the solid."""
+def marble(p: Vectors, n: Vectors, kit: Kit) -> Vectors:
+    """Draw pale stone with veins of several sizes through the solid."""
     cloud = kit.noise.solid(p * 6.0) + 0.5 * kit.noise.solid(p * 13.0) + 0.25 * kit.noise.solid(p * 29.0)
     fine = kit.noise.solid(p * 31.0) + 0.5 * kit.noise.solid(p * 67.0) + 0.25 * kit.noise.solid(p * 150.0)
     stone = between((0.93, 0.91, 0.88), (0.80, 0.79, 0.80), 0.5 + 0.5 * cloud)
@@ -296,8 +278,8 @@ def marble(p: Float[Tensor, "3 points"], n: Float[Tensor, "3 points"], kit: Kit)
     return cover(stone, (0.62, 0.50, 0.38), 0.5 * (1.0 - smoothstep(fine.abs() / 0.10)))
 
 
-def paving(p: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """Rings of granite setts around the middle."""
+def paving(p: Vectors, kit: Kit) -> Vectors:
+    """Draw rings of granite setts around the middle."""
     radius = (p[0] * p[0] + p[1] * p[1]).sqrt()
     ring = (radius / RING).floor()
     count = (2.0 * math.pi * (ring + 0.5) / 1.45).floor().clamp(min=1.0)
@@ -313,8 +295,8 @@ def paving(p: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
     return joined * mineral(kit, p[0], p[1], 0.09)
 
 
-def lawn(p: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """Grass in soft patches with a fine grain that fades with distance, and haze farther out."""
+def lawn(p: Vectors, kit: Kit) -> Vectors:
+    """Draw grass in soft patches with a fine grain that fades with distance, and haze farther out."""
     radius = (p[0] * p[0] + p[1] * p[1]).sqrt()
     patches = kit.noise.grain(p[0] * 0.9, p[1] * 0.9, 2)
     blades = kit.noise.grain(p[0] * 14.0, p[1] * 14.0, 4, 0.85)
@@ -323,8 +305,8 @@ def lawn(p: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
     return cover(grass, HORIZON, smoothstep((radius - HAZE[0]) / (HAZE[1] - HAZE[0])))
 
 
-def ground(p: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """Paving in the middle, lawn around it."""
+def ground(p: Vectors, kit: Kit) -> Vectors:
+    """Draw paving in the middle, lawn around it."""
     radius = (p[0] * p[0] + p[1] * p[1]).sqrt()
     paved = radius < PAVING_RADIUS
     colour = torch.empty_like(p)
@@ -335,8 +317,8 @@ def ground(p: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
     return colour
 
 
-def sky(d: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
-    """A smooth gradient with soft clouds, over unit directions from the middle of the scene."""
+def sky(d: Vectors, kit: Kit) -> Vectors:
+    """Draw a smooth gradient with soft clouds, over unit directions from the middle of the scene."""
     height = d[2].clamp(min=0.0)
     blue = between(HORIZON, ZENITH, smoothstep(height * 1.1))
     stretched = torch.stack([d[0] * 3.0, d[1] * 3.0, d[2] * 8.0])
@@ -345,8 +327,8 @@ def sky(d: Float[Tensor, "3 points"], kit: Kit) -> Float[Tensor, "3 points"]:
     return cover(blue, CLOUD, weight)
 
 
-def specular(normals: Float[Tensor, "3 points"], halfway: Float[Tensor, "3 points"]) -> Float[Tensor, "points"]:
-    """Blinn's highlight with exponent 64, by repeated squaring."""
+def specular(normals: Vectors, halfway: Vectors) -> Float[Tensor, "points"]:
+    """Return Blinn's highlight with exponent 64, by repeated squaring."""
     shine = dot(normals, halfway).clamp(min=0.0)
     for _ in range(6):
         shine = shine * shine

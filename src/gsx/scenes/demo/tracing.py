@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.shapes import Float, Int, UInt8
-from gsx.scenes.demo.solids import column, normalise, sphere_interval, sum_of, window
+from gsx.scenes.demo.solids import SPHERE, column, normalise, shape_interval, sum_of, window
 from gsx.scenes.demo.still_life import DOME, StillLife, ground_colour, sky_colour, thing_colour
 
 BAND_RAYS = 1 << 17  # rays evaluated at once: about 50 MB of working memory
@@ -29,7 +29,7 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What rays meet first."""
+    """First hits of rays."""
 
     depth: Float[Tensor, "*rays"]
     """Distance along the ray, scene units."""
@@ -39,25 +39,25 @@ class Hits:
 
 @dataclass(frozen=True, eq=False)
 class HitPoints:
-    """Points that rays meet."""
+    """First hits of rays as points."""
 
     points: Float[Tensor, "3 points"]
-    """World, scene units."""
+    """World coordinates, scene units."""
     directions: Float[Tensor, "3 points"]
-    """Of the rays."""
+    """Directions of the rays."""
     owner: Int[Tensor, "points"]
     """Number of the solid, GROUND or SKY."""
 
 
 def camera_rays(camera: Camera, samples: int) -> Rays:
-    """Rays through the same `samples` places of every pixel, as a [3, samples, H, W] raster."""
+    """Return rays through the same `samples` places of every pixel, as a [3, samples, H, W] raster."""
     across, down = lattice(samples)
     columns, rows = (torch.arange(count, dtype=torch.float64) for count in camera.size)
     return rays_through(camera, columns + across[:, None, None], rows[:, None] + down[:, None, None])
 
 
 def lattice(count: int) -> Float[Tensor, "2 count"]:
-    """Places in the unit square on a golden-ratio (for 1, 2, 3, 5, 8, 13: Fibonacci) lattice, float64.
+    """Return places in the unit square on a golden-ratio (for 1, 2, 3, 5, 8, 13: Fibonacci) lattice, float64.
 
     Projected on either axis they are evenly spaced, so edges at any slope get nearly `count` grey levels.
     """
@@ -67,21 +67,21 @@ def lattice(count: int) -> Float[Tensor, "2 count"]:
 
 
 def rays_through(camera: Camera, u: Float[Tensor, "*#rays"], v: Float[Tensor, "*#rays"]) -> Rays:
-    """Rays through raster positions (u, v) in pixels, float64."""
+    """Return rays through raster positions (u, v) in pixels, float64."""
     x, y = slopes(u, camera.cx, camera.fx), slopes(v, camera.cy, camera.fy)
     directions = torch.stack([axis[0] * x + axis[1] * y + axis[2] for axis in camera.rotation.T.tolist()])
     return Rays(camera.centre.double(), normalise(directions))
 
 
 def slopes(position: Float[Tensor, "*rays"], principal: float, focal: float) -> Float[Tensor, "*rays"]:
-    """x/z or y/z of rays at positions along one axis of the raster, rounded to float32 last."""
+    """Return x/z or y/z of rays at positions along one axis of the raster, rounded to float32 last."""
     return ((position - round(principal * SUBPIXEL) / SUBPIXEL) / focal).float()
 
 
 def meet_backdrop(rays: Rays) -> Hits:
-    """The ground within the dome, the dome elsewhere."""
+    """Return the hits with the ground within the dome, and with the dome elsewhere."""
     origin = column(rays.origin, rays.directions)
-    dome = sphere_interval(origin / DOME, rays.directions / DOME)[1].nan_to_num(DOME)
+    dome = shape_interval(origin / DOME, rays.directions / DOME, SPHERE)[1].nan_to_num(DOME)
     floor = -origin[2] / rays.directions[2]
     grounded = (floor > 0) & (floor < dome)
     owner = torch.where(grounded, GROUND, SKY).to(torch.int8)
@@ -89,7 +89,7 @@ def meet_backdrop(rays: Rays) -> Hits:
 
 
 def trace(life: StillLife, rays: Rays, camera: Camera | None = None) -> Hits:
-    """What the rays meet first; with the camera they come from, each solid is only sought where it can be seen."""
+    """Return the first hits of rays; `camera`, from which they come, limits each solid to its window of the raster."""
     hits = meet_backdrop(rays)
     for number, solid in enumerate(life.solids):
         part = window(solid, camera) if camera else ()
@@ -104,68 +104,55 @@ def trace(life: StillLife, rays: Rays, camera: Camera | None = None) -> Hits:
 
 
 def hit_points(rays: Rays, hits: Hits) -> HitPoints:
-    """What rays meet, as a list."""
+    """Flatten hits to a list of points."""
     directions = rays.directions.flatten(1)
     points = column(rays.origin, directions) + directions * hits.depth.flatten()
     return HitPoints(points, directions, hits.owner.flatten())
 
 
-def joined(parts: Sequence[HitPoints]) -> HitPoints:
-    """What several bundles of rays meet, one after another."""
-    points, directions, owners = zip(*((part.points, part.directions, part.owner) for part in parts), strict=True)
-    return HitPoints(torch.cat(points, 1), torch.cat(directions, 1), torch.cat(owners))
-
-
-def seen_at(
+def points_at(
     life: StillLife,
     cameras: Sequence[Camera],
     places: Sequence[Float[Tensor, "2 _"]],
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> HitPoints:
-    """What cameras see at places of their pictures, px, float64, moved to the right and down."""
-    right, down = shift
-    bundles = [rays_through(camera, u + right, v + down) for camera, (u, v) in zip(cameras, places, strict=True)]
-    return joined([hit_points(rays, trace(life, rays)) for rays in bundles])
+    """Return the hits at places (px, float64) of the cameras' pictures, shifted to the right and down."""
+    bundles = [rays_through(camera, u + shift[0], v + shift[1]) for camera, (u, v) in zip(cameras, places, strict=True)]
+    parts = [hit_points(rays, trace(life, rays)) for rays in bundles]
+    points, directions = (torch.cat([getattr(part, name) for part in parts], 1) for name in ("points", "directions"))
+    return HitPoints(points, directions, torch.cat([part.owner for part in parts]))
 
 
-def colours_of(life: StillLife, seen: HitPoints) -> Float[Tensor, "3 points"]:
-    """Display colours, in [0, 1]."""
-    colour = torch.empty_like(seen.points)
-    for number in seen.owner.unique().tolist():
-        for chosen in (seen.owner == number).nonzero()[:, 0].split(BAND_RAYS):
-            points, directions = (all_of.index_select(1, chosen) for all_of in (seen.points, seen.directions))
-            colour.index_copy_(1, chosen, owner_colour(life, number, points, directions))
+def colours_of(life: StillLife, hits: HitPoints) -> Float[Tensor, "3 points"]:
+    """Return display colours of hits, in [0, 1]."""
+    colour = torch.empty_like(hits.points)
+    for number in hits.owner.unique().tolist():
+        for chosen in (hits.owner == number).nonzero()[:, 0].split(BAND_RAYS):
+            points, directions = (vectors.index_select(1, chosen) for vectors in (hits.points, hits.directions))
+            if number == SKY:
+                part = sky_colour(life, points)
+            elif number == GROUND:
+                part = ground_colour(life, points)
+            else:
+                part = thing_colour(life.things[number], life.kit, points, directions)
+            colour.index_copy_(1, chosen, part)
     return colour.clamp(0.0, 1.0)
 
 
 def shade(life: StillLife, rays: Rays, hits: Hits) -> Float[Tensor, "3 *rays"]:
-    """Display colours of what the rays meet, in [0, 1]."""
+    """Return display colours of hits, in [0, 1], on the raster of the rays."""
     return colours_of(life, hit_points(rays, hits)).reshape(rays.directions.shape)
 
 
-def owner_colour(life: StillLife, number: int, points: Tensor, directions: Tensor) -> Float[Tensor, "3 points"]:
-    """Display colour of points of one owner, seen along unit directions."""
-    if number == SKY:
-        return sky_colour(life, points)
-    if number == GROUND:
-        return ground_colour(life, points)
-    return thing_colour(life.things[number], life.kit, points, directions)
-
-
-def average(colours: Float[Tensor, "3 samples H W"]) -> Float[Tensor, "3 H W"]:
-    """Mean over the samples of every pixel, in display light as splats are blended, added in a fixed order."""
-    return sum_of(list(colours.unbind(1))) / colours.shape[1]
-
-
 def render(life: StillLife, camera: Camera, samples: int) -> UInt8[Tensor, "3 H W"]:
-    """The picture `camera` takes, `samples` rays per pixel; bands of rows bound the memory."""
+    """Render a camera's picture, `samples` rays per pixel; bands of rows bound the memory."""
     rows = max(1, BAND_RAYS // (camera.width * samples))
     bands = [camera.crop(0, top, camera.width, min(rows, camera.height - top)) for top in range(0, camera.height, rows)]
     return torch.cat([render_band(life, band, samples) for band in bands], dim=1)
 
 
 def render_band(life: StillLife, camera: Camera, samples: int) -> UInt8[Tensor, "3 H W"]:
-    """The picture of one band."""
+    """Render one band: means of each pixel's samples in display light, as splats are blended, in a fixed order."""
     rays = camera_rays(camera, samples)
     colours = shade(life, rays, trace(life, rays, camera))
-    return (average(colours) * 255.0 + 0.5).to(torch.uint8)
+    return (sum_of(list(colours.unbind(1))) / samples * 255.0 + 0.5).to(torch.uint8)

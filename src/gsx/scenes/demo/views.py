@@ -1,6 +1,5 @@
-"""The built-in scene as data: cameras on a spiral, pictures rendered when asked for, points on what they see."""
+"""The built-in scene as data: cameras on a spiral, pictures rendered on demand, points on visible surfaces."""
 
-import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,11 +21,9 @@ from gsx.engine.cache import cache_folder, content_key
 from gsx.engine.cached_images import cache_image, read_cached_image
 from gsx.scenes.demo.passer_by import with_passer_by
 from gsx.scenes.demo.still_life import StillLife, make_still_life
-from gsx.scenes.demo.tracing import colours_of, render, seen_at
+from gsx.scenes.demo.tracing import colours_of, points_at, render
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.splits import parse_rule
-
-logger = logging.getLogger(__name__)
 
 TARGET = (0.0, 0.05, 0.50)  # every camera looks here
 FIELD_OF_VIEW = math.radians(50.0)  # horizontal
@@ -39,8 +36,10 @@ VERSION = "e26aec382d8f4c08"  # of the pictures, in protocols and the cache: giv
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(SceneOptions):
-    """The built-in scene; `path` and what concerns photographs do not apply to it. `split` must be readable: `none`
-    trains on test views as well, and all others mean the test views between training views."""
+    """Options of `conf/scene/demo.yaml`; `path` and options of photographs do not apply.
+
+    `split=none` trains on test views as well; all other rules mean the test views between training views.
+    """
 
     width: Annotated[int, Range(1, 16384)]
     """Width of the pictures before `downscale`, pixels."""
@@ -52,9 +51,9 @@ class DemoOptions(SceneOptions):
     samples: Annotated[int, Range(1, 64)]
     """Rays per pixel, averaged in display light."""
     seed: Seed
-    """Of the initial points."""
+    """Seed of the initial points."""
     passer_by: bool = False
-    """Somebody stands before each training camera. The default: runs older than this option."""
+    """A person stands before each training camera. The default: runs older than this option."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,16 +67,16 @@ class DemoSource:
     folder: Path
 
     def max_zoom(self, camera: Camera) -> float:
-        """There is no end to the detail."""
+        """Return infinity: detail has no end."""
         return math.inf
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
-        """What `camera` sees; a crop gives the very bytes of the picture it is cut from."""
+        """Return the picture of a camera; a crop has the same bytes as the whole picture there."""
         key = camera_key(camera)
         return self.cache.get((self.folder, key), lambda: self.picture(camera, self.folder / f"{key}.png"))
 
     def picture(self, camera: Camera, path: Path) -> UInt8[Tensor, "3 H W"]:
-        """Rendered, or read where an earlier run has rendered it."""
+        """Render a picture, or read it where an earlier run has rendered it."""
         if not same_view(camera, self.own):
             return render(self.life, camera, self.samples)
         kept = read_cached_image(path)
@@ -89,20 +88,20 @@ class DemoSource:
 
 
 def same_view(camera: Camera, own: Camera) -> bool:
-    """Whether `camera` is `own` at some resolution, and no crop of it."""
+    """Return whether `camera` is `own` at some resolution, and no crop of it."""
     back = camera.resize(*own.size)
     intrinsics = ((back.fx, own.fx), (back.fy, own.fy), (back.cx, own.cx), (back.cy, own.cy))
     return camera.has_pose_of(own) and all(abs(a - b) < SAME for a, b in intrinsics)
 
 
 def camera_key(camera: Camera) -> str:
-    """A digest of everything that a picture depends on."""
+    """Digest everything that a picture depends on."""
     pose = camera.rotation.tolist(), camera.translation.tolist()
     return content_key(*pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
 
 
 def spiral_camera(place: float, width: int, height: int) -> Camera:
-    """The camera at `place` in [0, 1) of a rising spiral around the scene that sways nearer and farther."""
+    """Return the camera at `place` in [0, 1) of a rising spiral around the scene at varying distance."""
     azimuth = 2 * math.pi * TURNS * place - math.pi / 2
     elevation = ELEVATION[0] + (ELEVATION[1] - ELEVATION[0]) * place
     distance = DISTANCE - SWAY * math.cos(2 * math.pi * SWAYS * place)
@@ -113,15 +112,15 @@ def spiral_camera(place: float, width: int, height: int) -> Camera:
 
 
 def sample_points(life: StillLife, cameras: Sequence[Camera], count: int, generator: torch.Generator) -> PointCloud:
-    """Surface and sky points with their colours: what random rays of the cameras meet, equally many from each."""
+    """Return coloured points where random rays of the cameras meet surfaces and sky, equally many from each."""
     shares = [count // len(cameras) + (index < count % len(cameras)) for index in range(len(cameras))]
     places = [random_places(camera, share, generator) for camera, share in zip(cameras, shares, strict=True)]
-    seen = seen_at(life, cameras, places)
-    return PointCloud(seen.points.T.contiguous(), (colours_of(life, seen).T.contiguous() * 255.0 + 0.5).to(torch.uint8))
+    hits = points_at(life, cameras, places)
+    return PointCloud(hits.points.T.contiguous(), (colours_of(life, hits).T.contiguous() * 255.0 + 0.5).to(torch.uint8))
 
 
 def random_places(camera: Camera, count: int, generator: torch.Generator) -> Float[Tensor, "2 count"]:
-    """Places in the picture of a camera, px, float64."""
+    """Draw places in the picture of a camera, px, float64."""
     return torch.rand(2, count, generator=generator, dtype=torch.float64) * torch.tensor([camera.size]).T
 
 
@@ -130,37 +129,35 @@ def check(options: DemoOptions) -> None:
     parse_rule(options.split)
     if options.path:
         raise ConfigError(
-            f"scene=demo takes no path, but scene.path is {options.path}: say what that folder is with "
-            f"scene=colmap, photos, blender, transforms or bungee (gsx scenes {options.path} tells)."
+            f"scene=demo takes no path, but scene.path is {options.path}: choose scene=colmap, photos, blender, "
+            f"transforms or bungee (`gsx scenes {options.path}` detects it)."
         )
     if options.unit != 1:
-        raise ConfigError(f"scene=demo knows its truth in its own units only, but scene.unit is {options.unit}.")
+        raise ConfigError(f"scene=demo has units of its own, but scene.unit is {options.unit}: set scene.unit=1.")
     if options.test_views > options.train_views:
-        raise ConfigError(
-            f"scene.test_views={options.test_views} exceeds scene.train_views={options.train_views}: test cameras "
-            "stand between training cameras, so use as many at most."
-        )
+        views = f"scene.test_views={options.test_views} exceeds scene.train_views={options.train_views}"
+        raise ConfigError(f"{views}: set at most as many, as test cameras stand between training cameras.")
 
 
 def make_views(group: str, cameras: Sequence[Camera], source: Callable[[str, Camera], DemoSource]) -> list[View]:
-    """Numbered views, each with its own source."""
+    """Return numbered views, each with its own source."""
     named = {f"{group}_{index:03d}": camera for index, camera in enumerate(cameras)}
     return [View(name, camera, source(name, camera)) for name, camera in named.items()]
 
 
 def load(options: DemoOptions) -> Scene:
-    """Return the built-in scene; its pictures are rendered when first asked for. ConfigError: see `check`."""
+    """Return the built-in scene, whose pictures are rendered at first use; ConfigError: see `check`."""
     check(options)
-    return photographed(options, make_still_life(), spiral_camera, sample_points, "demo", VERSION, "a spiral")
+    return scene_along(options, make_still_life(), spiral_camera, sample_points, "demo", VERSION, "a spiral")
 
 
 CameraAt = Callable[[float, int, int], Camera]
 """(place in [0, 1) of a path, width, height) -> the camera there."""
 PointsOf = Callable[[StillLife, Sequence[Camera], int, torch.Generator], PointCloud]
-"""(what there is, cameras, how many, generator) -> points to start from."""
+"""(things, cameras, count, generator) -> initial points."""
 
 
-def photographed(
+def scene_along(
     options: DemoOptions,
     life: StillLife,
     camera_at: CameraAt,
@@ -170,10 +167,9 @@ def photographed(
     path: str,
     floor: float = 0.0,
 ) -> Scene:
-    """An arrangement seen along a path: training cameras evenly on it, test cameras half-way between neighbours.
+    """Place training cameras evenly along a path, and test cameras half-way between neighbours.
 
-    name: of the format and of its cached pictures; version: of these; path: its name;
-    floor: height of what people stand on, scene units.
+    name, version: of the format and its cached pictures; path: name of the path; floor: its height, scene units.
     """
     size = training_size(options.width, options.height, options.downscale, options.max_width)
     count = options.train_views
@@ -183,10 +179,10 @@ def photographed(
     cache = ImageCache(int(options.cache_gb * 1e9))
 
     def source(view: str, camera: Camera, somebody: bool) -> DemoSource:
-        seen = with_passer_by(life, camera, view, floor) if somebody else life
+        things = with_passer_by(life, camera, view, floor) if somebody else life
         who = ("passer by", view) if somebody else ()
         folder = cache_folder(name, content_key(version, options.samples, *who))
-        return DemoSource(life=seen, own=camera, samples=options.samples, cache=cache, folder=folder)
+        return DemoSource(life=things, own=camera, samples=options.samples, cache=cache, folder=folder)
 
     train_views = make_views("train", train, partial(source, somebody=options.passer_by))
     test_views = make_views("test", test, partial(source, somebody=False))
@@ -204,7 +200,7 @@ def photographed(
 
 
 def provenance(options: DemoOptions, size: tuple[int, int], name: str, version: str, path: str) -> dict[str, Any]:
-    """What decides how the pictures look, for the evaluation protocol."""
+    """Return everything that decides the pictures, for the evaluation protocol."""
     somebody = {"passer_by": True} if options.passer_by else {}
     return somebody | {
         "format": name,
