@@ -407,4 +407,4 @@ def test_a_lens_that_is_left_out_is_told(folder: Path) -> None:
     assert not any("states" in note for note in load(options(folder)).notes)
     write(folder, "train", [FRONT, SIDE], w=40, h=30, fl_x=100.0, k1=-0.2, cx=20)
     (note,) = (note for note in load(options(folder)).notes if "states" in note)
-    assert note.startswith("transforms_train.json states fl_x, k1, which the format's published readers and scene=blender leave out")
+    assert note.startswith("transforms_train.json states fl_x, k1, which the format's published readers and scene=bl")
