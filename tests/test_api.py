@@ -190,9 +190,9 @@ def test_the_page_does_what_it_says(
     monkeypatch.setattr(gsx, "train", lambda *_, **__: run, raising=False)  # trained above
     exec(page.split("```python\n")[1].split("```")[0], names := {})
     assert names["picture"].shape == (3, 144, 192)
-    assert names["beside"].shape == (3, 16, 16)
+    assert names["detail"].shape == (3, 16, 16)
     assert torch.equal(names["again"].render(names["view"], zoom=4), names["picture"])
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["four_times.png", "model.ply", "photograph.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["four_times.png", "model.ply", "photo.png"]
     told = capsys.readouterr().out.splitlines()
     assert told[0] == f"{run.folder} 3 {run.folder / 'report.html'}"
 
