@@ -50,7 +50,7 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
         )
     if count := getattr(options, "fill", 0):
         generator = torch.Generator().manual_seed(derived_seed("fill", settings.general.seed))
-        scene = filled(scene, count, generator)
+        scene = fill_gaps(scene, count, generator)
     return degrade(scene, getattr(options, "disturb", {}))
 
 

@@ -37,7 +37,7 @@ ALPHABET = "".join(GLYPHS)
 
 def strokes(glyph: str) -> list[tuple[float, float, float, float]]:
     """Return the straight lines (x0, y0, x1, y1) of one entry of GLYPHS."""
-    polylines = [[(float(x), float(y)) for x, y in polyline.split()] for polyline in glyph.split("|")]
+    polylines = [[(float(p[0]), float(p[1])) for p in polyline.split()] for polyline in glyph.split("|")]
     return [(*a, *b) for points in polylines for a, b in pairwise(points)]
 
 
