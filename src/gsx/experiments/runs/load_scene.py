@@ -108,24 +108,6 @@ def count_notes(settings: Settings) -> list[str]:
     return [] if count == published else [f"{images}/ holds {count} files, published are {published}: {compared}."]
 
 
-def with_more_points(scene: Scene, count: int, seed: int) -> Scene:
-    """Returns the scene with points where training views show none."""
-    if count == 0:
-        return scene
-    return fill_gaps(scene, count, torch.Generator().manual_seed(derived_seed("fill", seed)))
-
-
-def checked_unit(unit: float) -> float:
-    """Returns the unit.
-
-    Raises:
-        ConfigError: it is not a positive number.
-    """
-    if not 0 < unit < math.inf:
-        raise ConfigError(f"scene.unit is {unit}; give a positive number")
-    return unit
-
-
 def placed(scene: Scene, unit: float, origin: Origin | None) -> Scene:
     """Return the scene around an origin, in units; origin: in these units, None: chosen by the scene."""
     origin = scaled(origin_of(scene), unit) if origin is None else origin

@@ -75,9 +75,8 @@ def file_pictures(path: Path, cameras: Sequence[Camera] = (), axes: str = AUTO) 
     watch_cores()
     (gaussians, origin), raster = read_around(path, axes), rules_of(path)
     if cameras:
-        refuse_nothing_in_view(
-            gaussians, [relative_camera(camera, origin) for camera in cameras], "camera of the path", path, origin
-        )
+        around = [relative_camera(camera, origin) for camera in cameras]
+        refuse_nothing_in_view(gaussians, around, "camera of the path", path, origin)
     return lambda camera: render_gaussians(gaussians, relative_camera(camera, origin), raster, torch.zeros(3))
 
 
