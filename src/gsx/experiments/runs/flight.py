@@ -30,7 +30,7 @@ ENOUGH = 1_000_000
 
 def add_depth(run: Run, pictures: Pictures, pixels: int) -> None:
     """Add depth to each view of the report: near is bright, far is dark, nothing is black."""
-    for number, entry in zip(sorted(pictures.shown), pictures.views, strict=True):
+    for number, entry in zip(sorted(pictures.chosen), pictures.views, strict=True):
         picture, limits = depth_colours(*depth_and_coverage(run, run.scene.test[number].camera, pixels))
         entry["files"]["depth"] = pictures.save(f"{pictures.names[number]}.depth", picture)
         entry["depth"] = limits
@@ -65,7 +65,7 @@ def depth_colours(
 
 def add_flight(run: Run, pictures: Pictures, pixels: int) -> None:
     """Add a strip of frames, one below the other, from a whole view into its most detailed window."""
-    number = min(pictures.shown)
+    number = min(pictures.chosen)
     view = run.scene.test[number]
     place, zoom = goal(view, pictures)
     frames = [render(run, camera, pixels).image for camera in flight(view.camera, place, zoom)]
