@@ -1,1 +1,1 @@
-"""The core: scenes, rasterizer, training, evaluation. It knows no plugin by name."""
+"""Core: scenes, rasterizer, training. It imports no plugin."""

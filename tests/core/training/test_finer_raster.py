@@ -25,7 +25,7 @@ from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, rasterize
-from gsx.core.training.finer_raster import finer_raster, times_as_fine
+from gsx.core.training.finer_raster import finer_raster, render_scale
 from gsx.core.training.module import Modules
 from gsx.core.training.render import render, render_for_training
 from gsx.core.training.run import Run
@@ -49,7 +49,7 @@ def enlarged_then_reduced(image: Tensor, factor: int) -> Tensor:
 )
 def test_what_is_finer_itself_needs_less(zoom: float, supersample: int, times: int) -> None:
     views = small_scene(spread(4)).train
-    assert times_as_fine(views[0].camera.zoom(zoom), views, supersample) == times
+    assert render_scale(views[0].camera.zoom(zoom), views, supersample) == times
 
 
 def fresh(folder: Path, *more: str) -> Run:

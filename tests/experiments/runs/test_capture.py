@@ -57,7 +57,7 @@ def test_blurred_photographs_are_named_whichever_way_they_moved(walk):
     found = blurred(sharpness(walk))
     assert [path.name for path, _ in found] == ["09.png", "04.png"], "worst first"
     assert all(ratio < 0.6 for _, ratio in found)
-    assert "2 of 12 photographs are blurred" in sharpness_line(walk)
+    assert "2 of 12 photos are blurred" in sharpness_line(walk)
     assert "none of 4" in sharpness_line(walk[:4])
 
 
@@ -69,7 +69,7 @@ def test_photographs_without_contrast_are_not_blamed(walk, tmp_path):
     photos = [*walk[:4], flat, small]
     assert {path.name for path, _ in blurred(sharpness(photos))} == set()
     unknown = "2 have too few pixels or too little contrast to compare"
-    assert sharpness_line(photos) == f"sharpness none of 4 photographs is blurred against its neighbours; {unknown}"
+    assert sharpness_line(photos) == f"sharpness none of 4 photos is blurred against its neighbours; {unknown}"
     assert sharpness_line([flat, small]) == f"sharpness not known; {unknown}"
 
 

@@ -30,7 +30,7 @@ class Contraction(torch.autograd.Function):
         ctx.save_for_backward(basis, rest)
         ctx.backend = backend
         contract = backend.kernel(contraction, variant=(len(basis),)) if backend.compiled else spread_contraction
-        return contract(rest[:], basis)  # always a view: torch compiles anew for other tensors
+        return contract(rest[:], basis)  # always a view: torch compiles again for other tensors
 
     @staticmethod
     @once_differentiable

@@ -76,9 +76,9 @@ def sharpness_line(photos: Sequence[Path]) -> str:
     if not known:
         return f"sharpness not known{unknown}"
     if not found:
-        return f"sharpness none of {len(known)} photographs is blurred against its neighbours{unknown}"
+        return f"sharpness none of {len(known)} photos is blurred against its neighbours{unknown}"
     worst = ", ".join(f"{path.name} ({ratio:.2f})" for path, ratio in found[:5]) + (", ..." if found[5:] else "")
     return (
-        f"sharpness {len(found)} of {len(known)} photographs are blurred against their neighbours, 1 being as sharp: "
+        f"sharpness {len(found)} of {len(known)} photos are blurred against their neighbours, 1 being as sharp: "
         f"{worst}; take them again, or leave them out{unknown}"
     )

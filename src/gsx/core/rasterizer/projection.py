@@ -104,7 +104,7 @@ def project(
     ids, dropped = chosen_rows(good, visible)  # before any division
     points, scales, quats, log_opacities, channels = (take_rows(values, ids) for values in fields)
     compensate = settings.compensate and settings.published_dilation
-    # tensors of one element: torch would compile anew for each number, and for each 0-dimensional float64 tensor
+    # tensors of one element: torch would compile again for each number, and for each 0-dimensional float64 tensor
     rules = scales.new_full((1,), dilation), compensate, scales.new_full((1,), drawn) if drawn else None
     shape = numbers[:4], numbers[4:6].to(scales), numbers[6:8].to(scales)
     backend = settings.backend.on(device, learning=True) if len(ids) > 1 else EAGER

@@ -20,11 +20,11 @@ SAME = 1e-6
 """Relative difference of focal lengths from rounding."""
 
 
-def times_as_fine(camera: Camera, photographs: Sequence[View], supersample: int) -> int:
+def render_scale(camera: Camera, photos: Sequence[View], supersample: int) -> int:
     """Returns the render scale of a camera: `supersample` up to the photos' focal length, less for finer cameras."""
     if supersample == 1:
         return 1
-    finest = max(view.camera.focal for view in photographs)
+    finest = max(view.camera.focal for view in photos)
     return max(1, min(supersample, math.ceil(supersample * finest / camera.focal - SAME)))
 
 

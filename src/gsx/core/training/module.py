@@ -105,7 +105,7 @@ class TrainingModule:
         return {}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restores the tensors of a checkpoint; empty: the module starts anew."""
+        """Restores the tensors of a checkpoint; empty: the module keeps its initial state."""
 
     def restarted(self, context: ModuleContext) -> "TrainingModule":
         """Returns a module for another run from step 0, on some of this run's views with their current corrections."""

@@ -10,7 +10,7 @@ from gsx.core.gaussians.splats import Gaussians, Splats, splats_of
 from gsx.core.rasterizer import TILE_PIXELS, RasterSettings, Rendering, TiledRendering, rasterize, rasterize_tiled
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.backbone import Drawn, Observation, behind_scene
-from gsx.core.training.finer_raster import finer_raster, times_as_fine
+from gsx.core.training.finer_raster import finer_raster, render_scale
 from gsx.core.training.run import Run
 
 
@@ -75,7 +75,7 @@ def render(
         depth: True: with depth, at the render's resolution. With a `Backdrop`, depth and alpha are those of the splats
             before it, so that a backdrop that shines through a wall does not move the wall.
     """
-    times = supersample or times_as_fine(camera, run.scene.train, run.views.raster_scale(run.model_step))
+    times = supersample or render_scale(camera, run.scene.train, run.views.raster_scale(run.model_step))
     raster = finer_raster(camera, run.scene.reduction, times)
     drawn = splats_for(run, raster.drawn_for) if splats is None else splats
     far = behind_scene(run.backbone, drawn.means) if depth else None

@@ -10,7 +10,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
 from gsx.core.shapes import Float
-from gsx.core.training.finer_raster import FinerRaster, finer_raster, times_as_fine
+from gsx.core.training.finer_raster import FinerRaster, finer_raster, render_scale
 from gsx.core.training.module import Modules, TrainingModule
 
 
@@ -62,7 +62,7 @@ class TrainingViews:
     def raster_for(self, step: int) -> Callable[[Camera], FinerRaster]:
         """Returns a function from a camera to its raster at a step."""
         scene, scale = self.scene, self.raster_scale(step)
-        return lambda camera: finer_raster(camera, scene.reduction, times_as_fine(camera, scene.train, scale))
+        return lambda camera: finer_raster(camera, scene.reduction, render_scale(camera, scene.train, scale))
 
     def raster_cameras(self, step: int) -> list[Camera]:
         """Returns the cameras of the training renders of a step."""
