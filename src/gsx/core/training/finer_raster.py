@@ -28,13 +28,13 @@ def render_scale(camera: Camera, photos: Sequence[View], supersample: int) -> in
     return max(1, min(supersample, math.ceil(supersample * finest / camera.focal - SAME)))
 
 
-def with_rim(camera: Camera, reduction: Reduction, times: int) -> tuple[Camera, Window]:
+def with_rim(camera: Camera, reduction: Reduction, scale: int) -> tuple[Camera, Window]:
     """Returns the camera with the rim of pixels that its reduced picture needs, and the camera's window in that raster.
 
     The rim ends at the frame. It makes a reduced crop the crop of the reduced picture.
     """
     whole = Window(0, 0, *camera.size)
-    frame, rim = camera.frame, reduction.rim if times > 1 else 0
+    frame, rim = camera.frame, reduction.rim if scale > 1 else 0
     left, right = (min(rim, max(0, room)) for room in (frame.left, frame.width - frame.left - camera.width))
     top, below = (min(rim, max(0, room)) for room in (frame.top, frame.height - frame.top - camera.height))
     if not (left or right or top or below):
@@ -54,15 +54,15 @@ class FinerRaster:
     window: Window
     """Window of the picture in the reduced one."""
     reduction: Reduction
-    times: int
+    scale: int
 
     def reduced(self, image: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
         """Returns the picture reduced from its finer render; differentiable, not clamped."""
-        return image if self.times == 1 else self.window.cut(self.reduction.unclamped(image, self.times))
+        return image if self.scale == 1 else self.window.cut(self.reduction.unclamped(image, self.scale))
 
 
-def finer_raster(camera: Camera, reduction: Reduction, times: int) -> FinerRaster:
-    """Returns the raster of a camera at `times` its resolution."""
-    wide, window = with_rim(camera, reduction, times)
-    finer = wide if times == 1 else wide.zoom(times)
-    return FinerRaster(drawn_for=wide, camera=finer, window=window, reduction=reduction, times=times)
+def finer_raster(camera: Camera, reduction: Reduction, scale: int) -> FinerRaster:
+    """Returns the raster of a camera at `scale` its resolution."""
+    wide, window = with_rim(camera, reduction, scale)
+    finer = wide if scale == 1 else wide.zoom(scale)
+    return FinerRaster(drawn_for=wide, camera=finer, window=window, reduction=reduction, scale=scale)

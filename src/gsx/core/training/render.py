@@ -75,8 +75,8 @@ def render(
         depth: True: with depth, at the render's resolution. With a `Backdrop`, depth and alpha are those of the splats
             before it, so that a backdrop that shines through a wall does not move the wall.
     """
-    times = supersample or render_scale(camera, run.scene.train, run.views.raster_scale(run.model_step))
-    raster = finer_raster(camera, run.scene.reduction, times)
+    scale = supersample or render_scale(camera, run.scene.train, run.views.raster_scale(run.model_step))
+    raster = finer_raster(camera, run.scene.reduction, scale)
     drawn = splats_for(run, raster.drawn_for) if splats is None else splats
     far = behind_scene(run.backbone, drawn.means) if depth else None
     if far is not None and bool(far.any()):
