@@ -9,7 +9,7 @@ their lists splat by splat, because each window comes from the one before. Formu
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.errors import ConfigError
-from gsx.core.rasterizer.composite import sum_by_splat
+from gsx.core.rasterizer.composite import batches, sum_by_splat
 from gsx.core.rasterizer.grid import TileGrid, pixel_centres
 from gsx.core.rasterizer.intersections import TileIntersections
 from gsx.core.rasterizer.projection import ScreenSplats
@@ -206,18 +206,16 @@ def walk(lists: Lists, tiles: Int[Tensor, "B"]) -> Iterator[Met]:
         window = tuple(behind)
 
 
-def batches(lists: Lists) -> Iterator[Int[Tensor, "B"]]:
-    """Yields tiles that have a list, longest first."""
-    lengths = lists.intersections.starts.diff()
-    order = torch.argsort(lengths, descending=True, stable=True)[: int((lengths > 0).sum())]
-    yield from order.split(max(1, BATCH_PIXELS // lists.grid.tile**2))
+def tile_batches(lists: Lists) -> Sequence[Int[Tensor, "B"]]:
+    """Returns tiles with splats, longest list first, in batches."""
+    return batches(lists.intersections.starts.diff(), BATCH_PIXELS // lists.grid.tile**2)
 
 
 def blend_windows(lists: Lists, max_weights: Float[Tensor, "E"] | None) -> Float[Tensor, "T P C"]:
     """Returns the blended channels of every tile; `max_weights`: receives each intersection's largest weight."""
     tiles = len(lists.intersections.starts) - 1
     pictures = lists.channels.new_zeros(tiles, lists.grid.tile**2, lists.channels.shape[1])
-    for batch in batches(lists):
+    for batch in tile_batches(lists):
         for met in walk(lists, batch):
             weight = met.before[0] * met.alpha
             pictures.index_add_(0, met.tiles, weight[..., None] * lists.channels[met.splats][:, None])
@@ -289,7 +287,7 @@ def gradients_of_lists(
     count = len(lists.intersections.splats)
     own, channels = lists.rows.new_zeros(count, 8), lists.rows.new_zeros(count, lists.channels.shape[1])
     passed = torch.zeros_like(pictures)
-    for batch in batches(lists):
+    for batch in tile_batches(lists):
         for met in walk(lists, batch):
             colour, by_colour = lists.channels[met.splats][:, None], gradient[met.tiles]
             weight = met.before[0] * met.alpha

@@ -8,7 +8,7 @@ are dense [B, K, P] arrays: B tiles, K splats, P pixels of a tile. exponent.py h
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -209,10 +209,10 @@ def front_gradient(
 # -- the walk over all tiles ---------------------------------------------------------------------------------------
 
 
-def batches(blocks: Blocks, settings: RasterSettings) -> list[Int[Tensor, "B"]]:
-    """Returns tiles with splats, longest list first, in batches of about `batch_values` alphas."""
-    order = torch.argsort(blocks.counts, descending=True, stable=True)[: int((blocks.counts > 0).sum())]
-    return list(order.split(max(1, settings.batch_values // (settings.chunk * settings.tile_size**2))))
+def batches(counts: Int[Tensor, "T"], size: int) -> Sequence[Int[Tensor, "B"]]:
+    """Returns the tiles with a count above 0, largest first, in batches of `size` (at least 1)."""
+    order = torch.argsort(counts, descending=True, stable=True)[: int((counts > 0).sum())]
+    return order.split(max(1, size))
 
 
 def walk(
@@ -240,7 +240,8 @@ def blend_all(
     """
     pictures = tables.channels.new_zeros(len(blocks.counts), tables.basis.shape[1], tables.channels.shape[2])
     fronts: list[Front] = []
-    for batch in batches(blocks, tables.settings):
+    size = tables.settings.batch_values // (tables.settings.chunk * tables.settings.tile_size**2)
+    for batch in batches(blocks.counts, size):
         for front, accumulated, weight in walk(tables, blocks, batch):
             pictures.index_add_(0, front.tiles, accumulated)
             if max_weights is not None:
