@@ -1,7 +1,4 @@
-"""Backends that run kernels: the tensor functions of rendering and losses. This one runs them in plain torch.
-
-A compositor may bring a backend that compiles them (`gsx.engine`).
-"""
+"""Backends run kernels, the tensor functions of rendering and losses; a compositor may bring one that compiles."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,4 @@
-"""Metadata of option fields: whether they change results.
-
-Fields made by `without_effect` and `label` do not enter the hash in a run's name, in gsx and in plugins.
-"""
+"""Metadata of option fields; `without_effect` and `label` keep a field out of the hash in a run's name."""
 
 from collections.abc import Mapping
 from dataclasses import field, fields, is_dataclass

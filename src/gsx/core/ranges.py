@@ -1,7 +1,6 @@
-"""Ranges of numeric options, part of their types and checked before a run creates its folder.
+"""Ranges of numeric options, checked before a run creates its folder: `steps: Annotated[int, Range(1, 100)]`.
 
-Use `steps: Annotated[int, Range(1, 100)]` in a dataclass of options, or a name below. In lists, the range holds for
-every number. Ends are included.
+In lists, the range holds for every number.
 """
 
 import functools

@@ -96,7 +96,7 @@ def write_image(
 
 @contextmanager
 def in_memory(place: Path) -> Iterator[str]:
-    """Yields the name of a file in memory, and copies its content to `place` at the end; other than on Linux, `place`.
+    """Yields the name of a file in memory (Linux) and copies it to `place` at the end; elsewhere yields `place`.
 
     OpenImageIO ignores errors of the disk under a PNG or GIF, and ends the process under a JPEG.
     """

@@ -216,10 +216,7 @@ def touches(
     camera: Camera,
     settings: RasterSettings,
 ) -> Bool[Tensor, "N"]:
-    """Marks Gaussians whose published 3-sigma square has tiles on the camera's raster (3D-GS, forward.cu).
-
-    Gaussians with values out of range are marked as well; the render counts them.
-    """
+    """Marks Gaussians whose published 3-sigma square touches the raster (3D-GS, forward.cu), and undrawable ones."""
     opaque = without_colours(means, scales, quats)
     screen, on = on_screen(opaque, camera, settings)
     mask = torch.zeros(len(means), dtype=torch.bool, device=means.device)

@@ -121,14 +121,11 @@ def select(
     colours: Float[Tensor, "N C"],
     numbers: Float[Tensor, "16"],
 ) -> tuple[Bool[Tensor, "N"], Bool[Tensor, "N"]]:
-    """Marks splats with all values in range, and those of them near the raster.
-
-    `points`: means in camera coordinates, float64. A depth that rounds to the near plane is not beyond it.
-    """
+    """Marks splats with all values in range, and those of them near the raster; `points`: camera means, float64."""
     lens = Lens(*numbers.unbind())
     a, b, c = scales.abs().unbind(1)
     largest_scales = a.maximum(b).maximum(c)
-    in_front = points[:, 2].to(means) > lens.near
+    in_front = points[:, 2].to(means) > lens.near  # rounded as in the render
     good = usable(means, scales, quats, log_opacities, colours)
     good = good & (in_range(points, largest_scales, lens) | ~in_front)
     return good, good & in_front & near_raster(points, largest_scales, lens)

@@ -1,8 +1,5 @@
-"""Pictures reduced from finer renders by the filter that made the photos.
-
-Neighbouring photos sample a scene between each other's pixels; a loss on reduced renders uses that (NeRF-SR, Wang et
-al. 2022; SRGS, Feng et al. 2024).
-"""
+"""Pictures reduced from finer renders by the photos' filter, since photos sample the scene between each other's pixels
+(NeRF-SR, Wang et al. 2022; SRGS, Feng et al. 2024)."""
 
 import math
 from collections.abc import Sequence

@@ -74,10 +74,7 @@ class ProbeRender:
         return self.gradient(self.colours, difference.square().sum(0, keepdim=True).expand(3, -1, -1) / 3).sum(1)
 
     def removal_changes(self, signs: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:
-        """Sums the change of the picture without each splat over its values with random signs.
-
-        The mean square, also of a sum over splats, is the squared change without them. The bound on alpha is ignored.
-        """
+        """Sums each splat's change of the picture with random signs; the mean square is the squared change."""
         return self.gradient(self.log_opacities, signs)
 
     def blending_squares(self, signs: Float[Tensor, "3 H W"]) -> Float[Tensor, "M"]:

@@ -1,7 +1,6 @@
-"""Several views in one step, on one process or several: gradients, losses and observations of their mean loss.
+"""Several views in one step, on one process or several: gradients and observations of their mean loss.
 
-Backward runs for each view's loss; the sums are divided at the end. An observation counts by its weight in the mean
-loss (`backbones.density`), so that published thresholds hold for any number of views.
+Observations count by their weight in the mean loss, so that published thresholds hold for any number of views.
 """
 
 from collections import Counter

@@ -39,10 +39,7 @@ def without_windows(term: Term, camera: Camera, windows: Sequence[Window]) -> Te
 
 
 def reusable_parts(term: Term, camera: Camera, random_background: bool) -> Divided:
-    """Separates the parts of a term whose cameras draw just what the training view's does.
-
-    A term that density control does not observe has none: its gradients could not be separated from the view's.
-    """
+    """Separates the parts of a term whose cameras draw what the training view's does; none of unobserved terms."""
     if random_background or not (term.shared and term.observed):
         return term, ()
     reused = [part for part in term.parts if part[0].camera.draws_as(camera)]

@@ -9,10 +9,7 @@ from gsx.core.seeds import derived_seed
 
 @dataclass(eq=False)
 class Sampler:
-    """Random order of training views without replacement, reshuffled after each pass (3D-GS, train.py).
-
-    Each order depends only on the seed and its number, so the next views are known in advance.
-    """
+    """Random order of training views, reshuffled after each pass (3D-GS, train.py), from the seed alone."""
 
     count: int
     """Number of training views."""
