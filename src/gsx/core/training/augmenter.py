@@ -66,8 +66,8 @@ class Replacing(Protocol):
 class Accounting(Protocol):
     """An augmenter that counts the pictures it requests and loses.
 
-    An account has `event`, the model's step at the last event, and counts by scale: requests (`asked`),
-    `dropped`, and `warned` by check.
+    An account has `event`, the model's step at the last event, and counts by scale with the keys of
+    `minibatch.sum_accounts`: requested, dropped, and warned by check.
     """
 
     def account(self, step: int) -> dict[str, Any]:
