@@ -91,5 +91,5 @@ def test_it_is_refused_with_a_remedy() -> None:
 
 def test_without_the_package_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(ConfigError, match=r"pip install 'gsx.gsplat.', or choose rasterizer=auto"):
+    with pytest.raises(ConfigError, match=r"pip install 'gsx.gsplat.', or set rasterizer=auto"):
         GsplatCompositor().refuse(RasterSettings(**RULES), CPU)

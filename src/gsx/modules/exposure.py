@@ -87,12 +87,12 @@ Measure: TypeAlias = Callable[[int], Light]
 
 def light_of(pair: Pair, slopes: bool) -> Light:
     """Measures a photo's light; slopes: also within the photo."""
-    image, photo, _ = pair
+    image, photo, mask = pair
     within = light_slopes(image, photo, usable_pixels(*pair), MIN_BLOCK_PIXELS) if slopes else None
     half = image.shape[2] // 2
     parts = (slice(None), slice(half), slice(half, None))
-    halves = [[None if values is None else values[..., part] for values in pair] for part in parts]
-    return Light(torch.stack([log_gains(*half) for half in halves]), within)
+    gains = [log_gains(image[..., p], photo[..., p], None if mask is None else mask[..., p]) for p in parts]
+    return Light(torch.stack(gains), within)
 
 
 def spreads_of(lights: Sequence[Light]) -> tuple[float, float]:
