@@ -2,6 +2,7 @@
 
 import sys
 from argparse import Namespace
+from collections.abc import Iterable
 from pathlib import Path
 
 from gsx.builtin import plugins
@@ -14,7 +15,7 @@ from gsx.experiments.runs.inspect import describe
 from gsx.experiments.tables.datasets import described
 
 
-def write_lines(lines: list[str]) -> None:
+def write_lines(lines: Iterable[str]) -> None:
     """Write lines to standard output."""
     sys.stdout.write("\n".join([*lines, ""]))
 
