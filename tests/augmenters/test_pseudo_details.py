@@ -707,7 +707,7 @@ def test_options_are_checked(word: str, complaint: str) -> None:
 
 
 def test_unknown_augmenters_get_the_nearest_name() -> None:
-    with pytest.raises(ConfigError, match=r"augmenter=upscal.*Did you mean 'upscale'"):
+    with pytest.raises(ConfigError, match=r"Unknown augmenter 'upscal'.*Did you mean 'upscale'"):
         compose(["augmenter=[upscal]"], plugins())
 
 
