@@ -83,7 +83,7 @@ def test_external_plugins_can_be_switched_off(
 def test_its_augmenter_trains_with_its_regenerator(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     chosen = ("augmenter=steady_zoom", "regenerator/upscale=sharpened", "iterations=20", "training.log_every=1")
     assert main(words(tmp_path / "run", *chosen, *FEW)) == 0
-    assert "plan of steady_zoom: from 10" in capsys.readouterr().err
+    assert "schedule of steady_zoom: from 10" in capsys.readouterr().err
     lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert ["terms" in line for line in lines] == [False] * 10 + [True] * 10
     assert all(line["terms"]["steady_zoom"] > 0 for line in lines[10:])

@@ -119,7 +119,7 @@ def test_a_scene_beside_it_makes_no_sense(tmp_path: Path, capsys: pytest.Capture
     assert main([str(tmp_path), "scene=demo"]) == 2
     assert "'scene=demo' does not go with the folder" in capsys.readouterr().err
     assert main([str(tmp_path / "none")]) == 2
-    assert "Unknown command or path" in capsys.readouterr().err
+    assert "No such file or folder" in capsys.readouterr().err
 
 
 def test_sharpness_by_hand() -> None:

@@ -23,7 +23,7 @@ class Ended:
     @property
     def sentences(self) -> list[str]:
         """What it said to whoever gave the command."""
-        return [line for line in self.said.splitlines() if line.startswith("gsx: ")]
+        return [line for line in self.said.splitlines() if line.startswith(("gsx: ", "gsx "))]
 
 
 def preload(words: list[str], place: Path) -> None:

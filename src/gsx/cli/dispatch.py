@@ -4,6 +4,7 @@ import io
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from gsx import __version__
@@ -89,7 +90,8 @@ def dispatch_together(arguments: list[str]) -> int:
 def dispatch(arguments: list[str]) -> int:
     """Run the command that the words name."""
     first = arguments[0] if arguments else ""
-    if first == "help" or ({"--help", "-h"} & set(arguments) and first not in VERBS):
+    named = first and not first.startswith("-") and not is_override(first)  # a command or a path
+    if first == "help" or ({"--help", "-h"} & set(arguments) and not named):
         sys.stdout.write(HELP)
         return 0
     if arguments == ["--version"]:
@@ -102,7 +104,15 @@ def dispatch(arguments: list[str]) -> int:
         return VERBS[first](arguments[1:])
     if expand_home(first).exists():
         return TRAIN_FOLDER(arguments)
-    raise ConfigError(f"Unknown command or path '{first}'.{nearest(first, VERBS)} See gsx --help")
+    raise ConfigError(unknown_command(first))
+
+
+def unknown_command(word: str) -> str:
+    """Return the error for a word that is neither a command nor a path."""
+    if Path(word).name != word:
+        return f"No such file or folder: '{word}'. Check the path"
+    trains = " `gsx KEY=VALUE ...` and `gsx FOLDER` train." if word == "train" else nearest(word, VERBS)
+    return f"Unknown command or path '{word}'.{trains} See gsx --help"
 
 
 def command(parse: Callable[[list[str]], Any], module: str, function: str) -> Callable[[list[str]], int]:

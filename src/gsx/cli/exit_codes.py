@@ -20,7 +20,8 @@ def report_error(error: BaseException) -> int:
         return INTERRUPTED
     if not isinstance(error, GsxError | OSError):
         raise error
-    say(f"gsx: {os_sentence(error) if isinstance(error, OSError) else error}\n", as_error=True)
+    text = os_sentence(error) if isinstance(error, OSError) else str(error)
+    say(f"{text}\n" if text.startswith("gsx ") else f"gsx: {text}\n", as_error=True)
     return 2
 
 

@@ -232,7 +232,7 @@ class CachedFunction:
             with waiting(), creation_lock(file, wait=True):
                 known, slot = self.find(file, arguments)
                 if known is None:
-                    logger.info("compiling %s, once for all later runs ...", self.function.__name__)
+                    logger.info("compiling %s, once for all later runs ...", self.function.__name__.replace("_", " "))
                 code = known or self.make(slot, arguments)
         except Exception as error:  # of an experimental interface; torch.compile reports the true cause
             logger.info("%s is compiled, not cached (%s)", self.function.__name__, first_line(error))

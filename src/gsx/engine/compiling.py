@@ -39,7 +39,7 @@ WHOLE_LOOPS: dict[str, Any] = OWN_INDICES | {
 def complaint(device: str) -> str:
     """Compiles a few operations for a device; returns why that fails, or an empty text."""
     try:
-        compile_rows(test_of_the_compiler)(torch.ones(32, device=device))
+        compile_rows(test_kernel)(torch.ones(32, device=device))
     except Exception as error:  # a missing compiler, a broken one, a read-only cache: all mean eager
         return reason_of(error.__cause__ or error)
     return ""
@@ -51,7 +51,7 @@ def reason_of(error: BaseException) -> str:
     return next(filter(None, parts), first_line(error)).splitlines()[0]
 
 
-def test_of_the_compiler(x: Tensor) -> Tensor:
+def test_kernel(x: Tensor) -> Tensor:
     """Computes something that needs a vector library, to try the compiler."""
     return 2 * x.exp() + x.log()
 

@@ -107,6 +107,8 @@ def load_enu(options: BungeeOptions, folder: Path) -> Scene:
     Poses are OpenGL camera-to-world in scaled east-north-up coordinates with the ground at height 0.
     """
     file = folder / POSES_FILE
+    if not folder.is_dir():
+        raise InputError(f"'{folder}' is not a folder: check scene.path or data_root; `gsx datasets` lists the layout.")
     if not file.is_file():
         raise InputError(
             f"'{folder}' has neither a COLMAP model nor {POSES_FILE}, set scene.path to a folder with one."

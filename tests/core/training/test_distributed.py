@@ -265,7 +265,7 @@ def test_a_branch_from_a_trunk_equals_one_from_scratch(tmp_path: Path) -> None:
 def test_other_verbs_are_for_one_process(tmp_path: Path) -> None:
     refused = together("eval", str(tmp_path))
     assert sentences(refused) == [
-        f"gsx: gsx eval {tmp_path}: torchrun is for training one scene and for gsx resume; call gsx without it"
+        f"gsx eval {tmp_path}: torchrun is for training one scene and for gsx resume; call gsx without it"
     ]
 
 

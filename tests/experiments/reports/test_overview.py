@@ -565,8 +565,8 @@ def test_links_lead_to_no_run_twice_and_not_in_circles(folders: Path) -> None:
         (["{}/nowhere"], "gsx: {}/nowhere is no folder: give a run, or a folder with runs below it"),
         (["{}/mon", "{}/empty"], "gsx: there is no run below {}/empty (no folder with a config.yaml): give a folder"),
         (["{}/mon/a", "{}/mon/a/config.yaml"], "gsx: {}/mon/a/config.yaml is no folder"),
-        ([], "gsx: gsx report: the following arguments are required: DIR. See gsx report --help"),
-        (["{}/mon", "--too", "x"], "gsx: gsx report: unrecognized arguments: --too"),
+        ([], "gsx report: the following arguments are required: DIR. See gsx report --help"),
+        (["{}/mon", "--too", "x"], "gsx report: unrecognized arguments: --too"),
     ],
 )
 def test_errors_name_the_folder_and_the_remedy(

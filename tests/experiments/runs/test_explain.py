@@ -19,7 +19,7 @@ CONF = Path(__file__).parents[3] / "conf"
 def test_a_value_with_its_range_and_every_file_that_sets_it() -> None:
     lines = explain("training.supersampling.factor", [], plugins())
     assert lines[:2] == ["training.supersampling.factor = 2", "  whole number from 1 to 16"]
-    places = [re.fullmatch(r"  conf/(\S+):(\d+)  (\S+)", line) for line in lines]
+    places = [re.fullmatch(r"  set in conf/(\S+):(\d+)  (\S+)", line) for line in lines]
     told = {found[1]: (int(found[2]), found[3]) for found in places if found}
     assert list(told) == ["preset/zoom.yaml", "module/supersampling.yaml"]
     for name, (number, value) in told.items():
@@ -75,3 +75,15 @@ def test_an_unknown_key_gets_the_nearest(capsys: pytest.CaptureFixture[str]) -> 
         explain("trainin.batch", [], plugins())
     assert main(["explain", "training.batch", "training.batch=2"]) == 0
     assert capsys.readouterr().out.startswith("training.batch = 2\n")
+
+
+def test_one_option_is_chosen_where_it_starts_from_another() -> None:
+    """`auto` starts from `eager`, `gs3d_zoom` from `gs3d`."""
+    for group, chosen in (("rasterizer", "auto"), ("backbone", "gs3d_zoom")):
+        stars = [line.split()[1] for line in explain(group, [], plugins()) if line.startswith("* ")]
+        assert stars == [chosen]
+
+
+def test_a_key_of_another_choice_is_explained_by_it() -> None:
+    with pytest.raises(ConfigError, match=r"'scene.matcher' is a setting of scene=photos: `gsx explain scene.matcher"):
+        explain("scene.matcher", [], plugins())

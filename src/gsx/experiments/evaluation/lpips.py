@@ -141,7 +141,7 @@ def load_lpips(options: LpipsOptions) -> Lpips | None:
         missing = "head" if options.trunk else "trunk"
         raise InputError(f"metrics.lpips.{missing} is missing: give both weights files, or neither")
     if not options.trunk:
-        logger.info("LPIPS: n/a (no weights); give metrics.lpips.trunk=FILE and metrics.lpips.head=FILE")
+        logger.info("LPIPS is not measured without weights: metrics.lpips.trunk=FILE metrics.lpips.head=FILE")
         return None
     network = Lpips(options.net, options.input_range)
     trunk, trunk_hash = read_weights(options.trunk, "metrics.lpips.trunk")

@@ -94,7 +94,7 @@ def announce(run: Run, plugins: Plugins) -> None:
         logger.warning("plugin %s did not load: %s", failure.plugin, failure.reason)
     for name, part in plan_of(run).items():
         entries = [f"{key} {in_words(value)}" for key, value in part.items() if key != CAUTION]
-        logger.info("plan of %s: %s", name, ", ".join(entries))
+        logger.info("schedule of %s: %s", name, ", ".join(entries))
         if CAUTION in part:
             logger.warning("%s %s", name, part[CAUTION])
     logger.info(

@@ -5,11 +5,12 @@ import types
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, is_dataclass
 from pathlib import Path
+from textwrap import shorten
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
-from gsx.core.errors import ConfigError
+from gsx.core.errors import ConfigError, command
 from gsx.core.plugins import Plugins
 from gsx.core.ranges import Range, parts_of
 from gsx.experiments.run_folder.general_options import GeneralOptions
@@ -52,7 +53,7 @@ def explain(key: str, overrides: Sequence[str], plugins: Plugins) -> list[str]:
         values, groups = compositions.values(overrides), known_groups()
         known = dict.fromkeys([*dotted(values), *groups])
         if key not in known:
-            raise ConfigError(unknown_key(key, known))
+            raise ConfigError(key_of_another_choice(key, overrides, compositions) or unknown_key(key, known))
         settings, files = compositions.settings(overrides), parsed(compositions.sources(overrides))
         dotted_key = key.replace("/", ".")  # the content of a nested group
         value = value_at(key, values)
@@ -66,11 +67,33 @@ def explain(key: str, overrides: Sequence[str], plugins: Plugins) -> list[str]:
         return lines + below(dotted_key, values, files)
 
 
+def key_of_another_choice(key: str, overrides: Sequence[str], compositions: Compositions) -> str:
+    """Return an error that names a composition which has the key, such as scene=photos; empty: none has."""
+    group = key.partition(".")[0]
+    for name in listed(group) if group in ("scene", "backbone", "augmenter") else ():
+        word = f"{group}=[{name}]" if group == "augmenter" else f"{group}={name}"
+        try:
+            found = key in dotted(compositions.values([*overrides, word]))
+        except ConfigError:  # an option that needs others
+            continue
+        if found:
+            return f"'{key}' is a setting of {word}: `{command('explain', key, word)}`"
+    return ""
+
+
 def options_of(group: str, compositions: Compositions, files: Sequence[Parsed]) -> list[str]:
     """Return a line for each option of a group; those of the composition are marked."""
-    chosen = {file.source.file for file in files}
+    chosen = {file.source.file for file in files} - included(group, files)
     places = {name: compositions.file(f"{group}/{name}") for name in listed(group)}
     return [f"{'*' if file in chosen else ' '} {name:24} {head_of(file)}".rstrip() for name, file in places.items()]
+
+
+def included(group: str, files: Sequence[Parsed]) -> set[Path]:
+    """Return the files of a group that others of the same group start from."""
+    members = [file for file in files if file.source.file.parent.name == group.rpartition("/")[2]]
+    bases = [(file.source.file, base) for file in members for base in yaml.safe_load(file.text).get("defaults", [])]
+    plain = [(file, base.partition("@")[0].removeprefix(f"/{group}/")) for file, base in bases if isinstance(base, str)]
+    return {file.with_name(f"{base}.yaml") for file, base in plain if "/" not in base}
 
 
 def value_at(key: str, node: Any) -> Any:
@@ -90,7 +113,7 @@ def written(value: Any) -> str:
 
 def lines_of(entry: Entry) -> list[str]:
     """Return an entry in lines."""
-    first = f"{entry.place}  {entry.value}".rstrip()
+    first = f"set in {entry.place}  {entry.value}".rstrip()
     return [first, f"    {entry.comment}"] if entry.comment else [first]
 
 
@@ -101,7 +124,7 @@ def below(key: str, node: dict[str, Any], files: Sequence[Parsed]) -> list[str]:
     for name in dotted(inner):
         value = value_at(name, inner)
         if not isinstance(value, dict):
-            comment = comment_on(f"{key}.{name}", files)[:WIDTH]
+            comment = shorten(comment_on(f"{key}.{name}", files), WIDTH, placeholder=" ...")
             lines.append(f"  {f'{name}: {written(value)}':34} {comment}".rstrip())
     return ["", f"below {key}:", *lines] if lines else []
 
@@ -163,7 +186,7 @@ def head_of(file: Path) -> str:
         if not line.startswith("#"):
             break
         words += [line.lstrip("# ")] if "@package" not in line else []
-    return re.split(r"(?<!et al)\. ", " ".join(words))[0][:WIDTH]
+    return shorten(re.split(r"(?<!et al)\. ", " ".join(words))[0], WIDTH, placeholder=" ...")
 
 
 # -- types ---------------------------------------------------------------------------------------------------------
