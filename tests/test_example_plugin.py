@@ -145,7 +145,7 @@ def test_a_backbone_of_its_own_trains_on_it_resumes_and_is_exported(
     assert all(torch.equal(last[0][key], last[1][key]) for key in last[0])
     capsys.readouterr()
     assert main(["export", str(once), str(tmp_path / "spheres.ply")]) == 0
-    worst = float(re.search(r"rendered again: (\S+) dB", capsys.readouterr().err).group(1))
+    worst = float(re.search(r"(\S+) dB at worst", capsys.readouterr().err).group(1))
     assert worst > 60
 
 
