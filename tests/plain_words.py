@@ -17,7 +17,7 @@ from pages import PAGES, ROOT
 SOURCE, SETTINGS = ROOT / "src" / "gsx", ROOT / "conf"
 COUNTS = Path(__file__).with_suffix(".json")
 DIALECT = re.compile(
-    r"\b(told|tells?|seen|shown|given|asked|judg(?:e|es|ed|ing)|begun|wanted|doomed|heal(?:s|ed)?|earn(?:s|ed)?|heeded"
+    r"(?<!=)\b(told|tells?|seen|shown|given|asked|judg(?:e|es|ed|ing)|begun|wanted|doomed|heal(?:s|ed)?|earn(?:s|ed)?|heeded"
     r"|withheld|undone|beside|whoever|looked at|died without a word|taken for (?:right|wrong))\b",
     re.I,
 )
