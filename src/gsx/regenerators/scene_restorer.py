@@ -207,8 +207,8 @@ def learn(
     def loss_of() -> Tensor:
         render, photo = (part.to(device) for part in batch(pairs, options, generator))
         out = render + network(render)
-        slopes = sum((out.diff(dim=axis) - photo.diff(dim=axis)).abs().mean() for axis in (2, 3))
-        return (out - photo).abs().mean() + 0.1 * slopes
+        colours = (out - photo).abs().mean()  # before slopes: autograd adds gradients in this order
+        return colours + 0.1 * sum((out.diff(dim=axis) - photo.diff(dim=axis)).abs().mean() for axis in (2, 3))
 
     fit(network, loss_of, context, steps, options.rate)
 

@@ -336,7 +336,7 @@ def test_what_cannot_be_made_smaller_is_told_and_leaves_nothing(folder: Path, tm
     tiny_run(tmp_path / "judged", ("iterations=0", f"init={folder / 'point_cloud.ply'}", "rasterizer=eager"))
     with pytest.raises(InputError, match="is at step 1 of 2"):
         compact(tmp_path / "stopped", tmp_path / "a", 0.1, 1, [], plugins())
-    with pytest.raises(InputError, match="trained nothing: give that file"):
+    with pytest.raises(InputError, match=r"trained nothing\. Give that file"):
         compact(tmp_path / "judged", tmp_path / "b", 0.1, 1, [], plugins())
     assert not (tmp_path / "a").exists()
     assert not (tmp_path / "b").exists()

@@ -148,7 +148,7 @@ def test_name_tells_weights_apart(weights: dict, tmp_path: Path) -> None:
 def test_without_weights_there_is_no_figure(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, "gsx.experiments.evaluation.lpips"):
         assert load_lpips(options("", "")) is None
-    assert "n/a" in caplog.text
+    assert "LPIPS is not measured" in caplog.text
     assert "metrics.lpips.trunk" in caplog.text
 
 

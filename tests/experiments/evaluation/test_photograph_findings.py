@@ -233,7 +233,7 @@ def test_findings_lie_in_the_run_and_in_its_report(run: Run, capsys: pytest.Capt
     assert figures == sorted(figures)
     assert ["files" in entry for entry in index["views"]] == [True, True] + [False] * 6
     report = (run.folder / "report.html").read_text()
-    assert "8 photographs beside what the model shows" in report
+    assert "8 photographs compared with their renders" in report
     assert report.count('alt="truth of ' + index["views"][0]["name"]) == 1
     assert "repeats it" not in report
     drawn = sorted(path.name for path in (run.folder / "photographs").iterdir())
@@ -256,7 +256,7 @@ def test_a_damaged_index_is_told_and_makes_no_run_unfinished(run: Run) -> None:
         assert (files.photographs, list(files.problems)) == ({}, ["photographs/index.json"])
         assert (files.unfinished, state_of(files)) == (before.unfinished, state_of(before))
     path.write_text('{"step": 3, "median_psnr": null, "views": [{"name": "a", "psnr": null, "remarks": []}]}')
-    assert "1 photographs beside" in write_report(run.folder).read_text()
+    assert "1 photographs compared" in write_report(run.folder).read_text()
 
 
 def test_views_that_several_steps_show_are_looked_at_once(run: Run) -> None:

@@ -252,7 +252,7 @@ def test_best_and_worst_are_drawn_and_named(tmp_path: Path) -> None:
     run = make_run(tmp_path, views=9)
     write_pictures(run, OPTIONS, figures(run, zoom=(1,), psnrs=[5.0, 5, 9, 5, 5, 5, 1, 5, 5]))
     index = read_index(run)
-    assert len(index["views"]) == pictures.SHOWN
+    assert len(index["views"]) == pictures.DRAWN_VIEWS
     roles = {entry["name"]: entry["role"] for entry in index["views"]}
     assert roles["shots/2.png"] == "best"
     assert roles["shots/6.png"] == "worst"
