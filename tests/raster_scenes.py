@@ -2,6 +2,7 @@
 
 import json
 import os
+import random
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -21,8 +22,12 @@ from gsx.engine.compositors import COMPOSITORS
 
 
 def any_path(**options: Any) -> RasterSettings:
-    """Settings with all compositors of gsx."""
-    return RasterSettings(**options, compositors=COMPOSITORS)
+    """Settings with all compositors of gsx; `random`, which checks of shapes draw from, keeps its state."""
+    state = random.getstate()
+    try:
+        return RasterSettings(**options, compositors=COMPOSITORS)
+    finally:
+        random.setstate(state)
 
 
 def random_splats(count: int = 150, seed: int = 0, channels: int = 3, size: float = 0.08) -> Splats:
