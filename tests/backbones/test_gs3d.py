@@ -406,14 +406,21 @@ def test_an_event_without_candidates_costs_the_step_too() -> None:
     assert all(torch.equal(backbone.table[name], before[name]) for name in NAMES)
 
 
+def adam_steps(backbone: GS3D) -> dict[str, float]:
+    """Adam's count of steps of each parameter, which its bias corrections use."""
+    table = backbone.table
+    return {name: float(table.optimiser.state[table[name]].get("step", 0)) for name in NAMES}
+
+
 def test_a_reset_outside_an_event_costs_only_opacity_its_step() -> None:
     backbone = hand_made([0.0] * 2, [0.01] * 2, background=1.0)
     learn(backbone)
     backbone.densify_and_prune(500)
-    before = snapshot(backbone)
+    before, taken = snapshot(backbone), adam_steps(backbone)
     backbone.update(500)
     moved = [name for name in NAMES if not torch.equal(backbone.table[name], before[name])]
     assert moved == [name for name in NAMES if name != "opacity_logits"]
+    assert [name for name in NAMES if adam_steps(backbone)[name] > taken[name]] == moved
 
 
 def test_discard_forgets_gradients_without_moving() -> None:

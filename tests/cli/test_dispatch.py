@@ -609,3 +609,16 @@ def test_a_launcher_that_fails_is_one_sentence(
         "one after the other here with hydra/launcher=basic\n"
     )
     assert os.environ.get("HYDRA_FULL_ERROR") != "1"  # what other errors of this process print stays as it was
+
+
+def test_help_of_a_folder_is_that_of_gsx(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path), "--help"]) == 0
+    assert capsys.readouterr().out.startswith("gsx trains")
+    assert main(["train", "--help"]) == 2
+    assert "`gsx FOLDER` train" in capsys.readouterr().err
+
+
+def test_flags_are_not_abbreviated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`--t` does not run code that a folder names."""
+    assert main(["resume", str(tmp_path), "--t"]) == 2
+    assert "unrecognized arguments: --t" in capsys.readouterr().err

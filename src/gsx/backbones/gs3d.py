@@ -1,10 +1,12 @@
 """3D Gaussian Splatting (Kerbl et al. 2023): explicit Gaussians with adaptive density control (3D-GS)."""
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import Parameter
 from torch.nn.functional import normalize
 
 from gsx.backbones.capacity import MOST_VIEWS
@@ -200,6 +202,10 @@ class GS3D(SceneModel):
         self.table.set_rate("opacity_logits", rates.opacity_logits)
         for name in ("sh_dc", "sh_rest", "log_scales", "quats"):
             self.table.set_rate(name, faster * getattr(rates, name))
+
+    def zero_filled(self) -> Iterable[Parameter]:
+        """Returns the SH bands above 0: unused ones take part (3D-GS), edited parameters wait for a gradient."""
+        return [self.table["sh_rest"]]
 
     def update(self, step: int) -> None:
         """Takes one Adam step; bands above the chosen degrees stay 0."""

@@ -16,6 +16,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.ranges import Interval, Range, Steps
 from gsx.core.rasterizer import RasterSettings
+from gsx.core.rasterizer.settings import LEAST_VARIANCE
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import BackboneContext
 from gsx.core.training.parameter_table import ParameterTable
@@ -121,7 +122,7 @@ class MipFilter(Filter):
     def rules(self, raster: RasterSettings) -> RasterSettings:
         """Returns dilation by the kernel, with compensated opacities."""
         kernel = self.options.kernel or MATCHED[self.context.scene.reduction.filter]
-        return replace(raster, dilation=kernel, compensate=True)
+        return replace(raster, dilation=max(kernel, LEAST_VARIANCE), compensate=True)
 
     def refresh(self, table: ParameterTable, means: Float[Tensor, "N 3"], step: int = 0) -> None:
         """Computes sizes at the positions after a step (Mip-Splatting, compute_3D_filter)."""

@@ -1,7 +1,7 @@
 """Common base of free Gaussians and anchors."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -64,15 +64,18 @@ class SceneModel(ABC):
         """Returns the weighted mean volume of the drawn Gaussians, 0 for none; without a weight None."""
         return volume_loss(drawn.splats.scales, self.volume_weight) if self.volume_weight else None
 
+    def zero_filled(self) -> Iterable[Parameter]:
+        """Returns the parameters that take their Adam step with a zero gradient if the loss has none: all."""
+        return self.table.parameters.values()
+
     @abstractmethod
     def set_rates(self, step: int) -> None:
         """Sets the learning rates of a step."""
 
     def update(self, step: int) -> None:
-        """Takes one Adam step; unused SH bands have zero gradients, as in the published code (3D-GS)."""
-        parameters = self.table.parameters.values()
-        if any(parameter.grad is not None for parameter in parameters):
-            for parameter in parameters:
+        """Takes one Adam step; parameters that rest in the loss have zero gradients, as in the published code."""
+        if any(parameter.grad is not None for parameter in self.table.parameters.values()):
+            for parameter in self.zero_filled():
                 parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
         self.set_rates(step)
         take_adam_step(self.table)

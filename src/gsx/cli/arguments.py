@@ -25,7 +25,9 @@ class Parser(argparse.ArgumentParser):
     """Parser of one command whose mistakes are errors of one sentence, without the usage text."""
 
     def __init__(self, verb: str, description: str, usage: str | None = None) -> None:
-        super().__init__(prog=f"gsx {verb}", usage=usage and f"%(prog)s {usage}", description=description)
+        super().__init__(
+            prog=f"gsx {verb}", usage=usage and f"%(prog)s {usage}", description=description, allow_abbrev=False
+        )
 
     def add_overrides(self, description: str) -> None:
         """Add any number of KEY=VALUE as `overrides`."""

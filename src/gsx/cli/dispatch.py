@@ -90,8 +90,7 @@ def dispatch_together(arguments: list[str]) -> int:
 def dispatch(arguments: list[str]) -> int:
     """Run the command that the words name."""
     first = arguments[0] if arguments else ""
-    named = first and not first.startswith("-") and not is_override(first)  # a command or a path
-    if first == "help" or ({"--help", "-h"} & set(arguments) and not named):
+    if first == "help" or ({"--help", "-h"} & set(arguments) and first not in VERBS and not is_unknown(first)):
         sys.stdout.write(HELP)
         return 0
     if arguments == ["--version"]:
@@ -105,6 +104,11 @@ def dispatch(arguments: list[str]) -> int:
     if expand_home(first).exists():
         return TRAIN_FOLDER(arguments)
     raise ConfigError(unknown_command(first))
+
+
+def is_unknown(word: str) -> bool:
+    """Return True for a word that names neither a setting, an option nor a path."""
+    return bool(word) and not word.startswith("-") and not is_override(word) and not expand_home(word).exists()
 
 
 def unknown_command(word: str) -> str:

@@ -1,4 +1,4 @@
-"""Verbs on a finished run or a splat file: eval, photographs, render, view."""
+"""Verbs on a finished run or a splat file: eval, photographs, render, view, export, compact."""
 
 import logging
 import sys

@@ -37,7 +37,7 @@ DECODERS = {".compressed.ply": decode_compressed_ply, ".splat": decode_splat, ".
 MODE_WORDS = ("splatrendermode:", "antialiased")
 """First words of comments on compensated opacities."""
 
-REASONS = {"given": "set", "stated": "the file states"}
+REASONS = {"given": "the settings say", "stated": "the file states"}
 """Reasons for certain axes, for the log."""
 
 

@@ -201,7 +201,9 @@ def _image(image: Any, positions: Positions | None, file: Path) -> ModelImage:
     length = pose.rotation.norm()
     if not abs(length - 1) <= QUATERNION_TOLERANCE:
         quaternion = f"a quaternion of length {length:.3g} instead of 1"
-        raise InputError(f"The model {file.parent} turns {name} by {quaternion}: correct its pose.")
+        raise InputError(
+            f"The model {file.parent} turns {name} by {quaternion}: correct its pose, or make the model again."
+        )
     return ModelImage(
         name=name,
         camera_id=image.camera_id,
@@ -219,7 +221,8 @@ def _name(image: Any, file: Path) -> str:
         return str(image.name).replace("\\", "/")
     except UnicodeDecodeError as error:
         name = f"bytes that are no UTF-8 ({error.object!r})"
-        raise InputError(f"The model {file.parent} names an image by {name}: rename the photo.") from None
+        remedy = "rename the photo and reconstruct again."
+        raise InputError(f"The model {file.parent} names an image by {name}: {remedy}") from None
 
 
 def _stack(rows: Sequence[Any], width: int) -> Float[Tensor, "K W"]:

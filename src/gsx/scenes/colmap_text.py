@@ -70,7 +70,8 @@ def records_of(file: Path, read: Reader) -> Iterator[bytes]:
     except UnicodeDecodeError as problem:
         odd = problem.object[problem.start : problem.start + 8]
         place = f"({odd!r}, after line {lines.number})"
-        raise InputError(f"{file} holds bytes that are no UTF-8 {place}: save it as UTF-8.") from None
+        remedy = "save it as UTF-8, or rename the photos and reconstruct again."
+        raise InputError(f"{file} holds bytes that are no UTF-8 {place}: {remedy}") from None
     except (ValueError, OverflowError, struct.error) as problem:
         end = "" if str(problem).endswith(("?", ".")) else "."
         raise InputError(

@@ -151,7 +151,8 @@ def _points(part: FrameFile, views: Sequence[View], options: TransformsOptions) 
     if not float(2 * half) * options.unit > SAME_PLACE:
         raise InputError(
             f"All {len(views)} cameras of '{file}' stand within {float(2 * half):.3g} units of each other, as on a "
-            "tripod, so that random points would have no depth: set scene.points to a PLY file of the scene."
+            "tripod, so that random points would have no depth: set scene.points to a PLY file of the scene, or use "
+            "photos from different places."
         )
     generator = torch.Generator().manual_seed(options.seed)
     cloud = random_points(options.random_points, middle - half, middle + half, generator)

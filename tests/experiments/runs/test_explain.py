@@ -87,3 +87,9 @@ def test_one_option_is_chosen_where_it_starts_from_another() -> None:
 def test_a_key_of_another_choice_is_explained_by_it() -> None:
     with pytest.raises(ConfigError, match=r"'scene.matcher' is a setting of scene=photos: `gsx explain scene.matcher"):
         explain("scene.matcher", [], plugins())
+
+
+@pytest.mark.parametrize("group", ["dataset", "tracker", "preset", "budget", "module", "regenerator/upscale", "eval"])
+def test_groups_are_explained(group: str) -> None:
+    """One of them has an option without content."""
+    assert len(explain(group, [], plugins())) > 2

@@ -60,7 +60,7 @@ class RasterOptions:
     """`sample`: a splat's value at the pixel's centre, dilated, as published. `window`: its integral over what is left
     of the pixel (Gaussian Blending), exact where splats cover parts of pixels; several times slower. 1/12 px^2 of the
     dilation are the pixel's own; a compensated dilation is left out."""
-    training_focal: Annotated[float, Range(0, 1e9)] = 0.0
+    training_focal: Annotated[float, Range(0, 1e12)] = 0.0
     """Largest focal length of the training cameras, px; 0: every camera counts as one of them."""
     alpha_min: Share = 1 / 255
     """Smaller contributions are skipped (3D-GS, renderCUDA)."""

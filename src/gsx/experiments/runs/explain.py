@@ -91,7 +91,9 @@ def options_of(group: str, compositions: Compositions, files: Sequence[Parsed]) 
 def included(group: str, files: Sequence[Parsed]) -> set[Path]:
     """Return the files of a group that others of the same group start from."""
     members = [file for file in files if file.source.file.parent.name == group.rpartition("/")[2]]
-    bases = [(file.source.file, base) for file in members for base in yaml.safe_load(file.text).get("defaults", [])]
+    bases = [
+        (file.source.file, base) for file in members for base in (yaml.safe_load(file.text) or {}).get("defaults", [])
+    ]
     plain = [(file, base.partition("@")[0].removeprefix(f"/{group}/")) for file, base in bases if isinstance(base, str)]
     return {file.with_name(f"{base}.yaml") for file, base in plain if "/" not in base}
 
