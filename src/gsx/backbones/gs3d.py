@@ -205,7 +205,7 @@ class GS3D(SceneModel):
 
     def zero_filled(self) -> Iterable[Parameter]:
         """Returns the SH bands above 0: unused ones take part (3D-GS), edited parameters wait for a gradient."""
-        return [self.table["sh_rest"]]
+        return [self.table.parameters["sh_rest"]]
 
     def update(self, step: int) -> None:
         """Takes one Adam step; bands above the chosen degrees stay 0."""

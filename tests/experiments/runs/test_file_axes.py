@@ -73,7 +73,7 @@ def test_given_and_stated_axes_are_not_put_to_the_scene(
     write_gaussians(tmp_path / "a.spz", turned, spz=SpzForm(version=stated))
     read = in_axes_of(scene, read_splats(tmp_path / "a.spz", given))
     torch.testing.assert_close(read.means.float(), turned.means, atol=1 / 4096, rtol=0)
-    assert f"a.spz: axes rub, as {'set' if given == 'rub' else 'the file states'}" in caplog.text
+    assert f"a.spz: axes rub, as {'the settings say' if given == 'rub' else 'the file states'}" in caplog.text
 
 
 def test_what_the_scene_leaves_open_is_taken_as_specified(
