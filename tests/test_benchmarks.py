@@ -4,6 +4,8 @@ import json
 import math
 import sys
 from dataclasses import replace
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -671,6 +673,12 @@ def test_loops_are_timed_by_the_names_they_have(monkeypatch: pytest.MonkeyPatch)
     assert set(spent) == {name for names in LOOPS.values() for name in names}
     assert min(spent.values()) > 0
     assert compiled.compiled_loop is own
+
+
+@pytest.mark.parametrize(("module", "path"), [place[1:] for place in stages.PLACES])
+def test_stages_begin_with_functions_that_exist(module: str, path: str) -> None:
+    """A stage whose function was renamed would count as everything else."""
+    assert callable(attrgetter(path)(import_module(module)))
 
 
 def test_least_times_of_stages_by_hand() -> None:

@@ -24,7 +24,7 @@ PLACES = [
     ("tiles", "gsx.core.rasterizer.render", "intersect_tiles"),
     ("lists", "gsx.engine.compiled", "lay_out"),
     ("lists", "gsx.engine.compiled", "places_of"),
-    ("blending", "gsx.core.rasterizer.render", "blend"),
+    ("blending", "gsx.engine.compiled", "CompiledCompositor.__call__"),
     ("blending, backward", "gsx.engine.compiled", "CompiledComposite.backward"),
     ("loss", "gsx.core.training.trainer", "photometric"),
     ("backward, but for blending", "torch", "Tensor.backward"),
