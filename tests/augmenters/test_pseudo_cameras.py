@@ -20,23 +20,14 @@ from gsx.augmenters.cameras import (
     worst_window,
 )
 from gsx.augmenters.planner import Planner, Slot
-from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.camera import Camera, look_at, pinhole
 from gsx.core.data.window import Window
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 
 
 def camera(width: int = 1200, height: int = 800, focal: float = 1000.0) -> Camera:
-    return Camera(
-        rotation=torch.eye(3, dtype=torch.float64),
-        translation=torch.zeros(3, dtype=torch.float64),
-        fx=focal,
-        fy=focal,
-        cx=width / 2,
-        cy=height / 2,
-        width=width,
-        height=height,
-    )
+    return pinhole(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), focal, width, height)
 
 
 def intrinsics(seen: Camera) -> tuple[float, ...]:

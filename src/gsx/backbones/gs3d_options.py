@@ -21,8 +21,8 @@ class Rates:
     log_scales: Rate
     quats: Rate
     shortened: Share = 0.0
-    """In a run shorter than published, all rates but that of opacities (of means: the first) grow by
-    (published steps / steps)^shortened; 0: as published."""
+    """Exponent of the factor (published steps / steps)^shortened on all rates but that of opacities (of means: the
+    first) in runs shorter than published; 0: as published."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,7 +44,7 @@ class Axis:
     """One axis of a splat, and a window's extent along it: exp(-x^2 / 2 sigma^2) over [low, high]."""
 
     offset: Float[Tensor, "B P"]
-    """From the splat's mean to the window's middle, px."""
+    """Offset of the window's middle from the splat's mean, px."""
     side: Float[Tensor, "B P"]
     sigma: Float[Tensor, "B 1"]
 

@@ -108,7 +108,7 @@ class Reference:
     mask: Mask | None
     """Pixels of the photo that count; None: all."""
     offset: Motion
-    """From the prior's pose to that of the camera."""
+    """Motion from the prior's pose to that of the camera."""
     prior_weight: float
     """See `estimate_camera`. The same at half the size: a quarter of the pixels, half of the px."""
 

@@ -174,7 +174,7 @@ class FrontGradient:
     """Gradients of B blocks, and the colour of the blocks and all behind them."""
 
     rows: Float[Tensor, "B K 6"]
-    """From `row_gradient`."""
+    """Result of `row_gradient`."""
     channels: Float[Tensor, "B K C"]
     absolute: Float[Tensor, "B K 2"] | None
     """Sum over pixels of the absolute gradient of the mean, per axis."""

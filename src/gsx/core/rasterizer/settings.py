@@ -73,7 +73,7 @@ class RasterOptions:
     """`published`: a splat reaches the 16 px tiles of its 3-sigma square, as 3D-GS. `tight`: every pixel with
     alpha >= alpha_min, without truncation."""
     jacobian_margin: Annotated[float, Range(0, 100)] = 0.3
-    """In the Jacobian, x/z and y/z are clamped to the raster widened by this share of half its extent (3D-GS)."""
+    """Share of half the raster by which it is widened before x/z and y/z of the Jacobian are clamped to it (3D-GS)."""
     tile_size: Annotated[int, Range(1, 1024)] = 8
     """Edge of the compositing tiles, px; with cull=published a divisor of 16."""
     chunk: Annotated[int, Range(1, 4096)] = 16

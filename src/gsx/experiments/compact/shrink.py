@@ -64,7 +64,7 @@ class Candidate:
     primitives: int
     megabytes: float
     psnr: dict[str, float]
-    """By zoom."""
+    """PSNR by zoom, dB."""
     drop: float
     """Largest loss at any zoom against the whole model after the same fine-tuning, dB."""
 

@@ -26,7 +26,7 @@ class Comparison:
     options: dict[str, Any]
     """Options of its augmenters and regenerators, by dotted key."""
     gains: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    """By zoom."""
+    """Gains by zoom."""
     cost: list[float] = field(default_factory=list)
     """Training time over that of the baseline."""
     seeds: list[int] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""From settings to a run in memory: device, backbone, augmenters."""
+"""Construction of a run from settings: device, backbone, augmenters."""
 
 import logging
 import os

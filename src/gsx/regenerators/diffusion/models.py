@@ -1,4 +1,4 @@
-"""From a folder or an id to a pipeline in memory. Nothing uses the network unless `download=true`."""
+"""Loading of pipelines from a folder or an id. Nothing uses the network unless `download=true`."""
 
 import hashlib
 import json
