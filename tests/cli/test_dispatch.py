@@ -21,6 +21,7 @@ from tiny import OVERRIDES, tiny_run, words
 
 from gsx import __version__
 from gsx.cli.dispatch import VERBS, main
+from gsx.core.backend import EAGER
 from gsx.core.data.images import write_image
 from gsx.engine.compiling import available
 
@@ -95,7 +96,7 @@ def test_eval_draws_by_the_path_of_training_and_names_it(
     assert environment["rasterizer"] == "eager"  # so short a run is not compiled for
     (folder / "environment.json").write_text(json.dumps(environment | {"rasterizer": "compiled"}))
     monkeypatch.setattr("gsx.engine.backend.available", lambda device: True)  # nothing is compiled all the same:
-    monkeypatch.setattr("gsx.engine.backend.HOW", {})
+    monkeypatch.setattr("gsx.engine.backend.compiled_kernel", lambda kernel, last, _: EAGER.kernel(kernel, *last))
     monkeypatch.setattr("gsx.engine.compiled.available", lambda device: False)
     monkeypatch.setattr("gsx.experiments.runs.rasterizer_path.warm", lambda *_, **__: None)
 
