@@ -51,18 +51,20 @@ def add_modules(registry: Registry) -> None:
 
 
 def add_augmenters(registry: Registry) -> None:
-    """Register one procedure under four names with different numbers."""
+    """Register one procedure under five names with different numbers."""
     from gsx.augmenters.pseudo_details import PseudoDetails
     from gsx.augmenters.pseudo_options import PseudoOptions
 
-    for name in ("upscale", "bootstrap", "mipmap", "bootstrap_original"):
+    for name in ("upscale", "super_resolved", "bootstrap", "mipmap", "bootstrap_original"):
         registry.add("augmenter", name, PseudoDetails, PseudoOptions)
 
 
 def add_regenerators(registry: Registry) -> None:
-    """Register filters, networks that learn from the scene itself, and functions."""
+    """Register filters, networks that learn from the scene itself, functions, and pretrained networks."""
     from gsx.regenerators.called import Called, CalledOptions
     from gsx.regenerators.classical import Oracle, PlainOptions, Resampled, Unchanged
+    from gsx.regenerators.pretrained.options import PretrainedOptions
+    from gsx.regenerators.pretrained.upscaler import Pretrained
     from gsx.regenerators.scene_restorer import RestorerOptions, SceneRestorer
     from gsx.regenerators.scene_sr import SceneSR, SceneSROptions
 
@@ -72,6 +74,8 @@ def add_regenerators(registry: Registry) -> None:
     registry.add("regenerator", "scene_sr", SceneSR, SceneSROptions)
     registry.add("regenerator", "scene_restorer", SceneRestorer, RestorerOptions)
     registry.add("regenerator", "callable", Called, CalledOptions)
+    for name in ("span", "real_esrgan", "ncnn"):
+        registry.add("regenerator", name, Pretrained, PretrainedOptions)
 
 
 def add_diffusion(registry: Registry) -> None:

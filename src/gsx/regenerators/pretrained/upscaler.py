@@ -1,0 +1,136 @@
+"""Pretrained upscalers: SPAN, Real-ESRGAN, and any network in a file of ncnn or ONNX."""
+
+import itertools
+import json
+import math
+from collections.abc import Iterable, Sequence
+from functools import partial
+from importlib.metadata import version
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.reduction import Reduction
+from gsx.core.data.scene import View
+from gsx.core.errors import ConfigError
+from gsx.core.files import replace_file
+from gsx.core.shapes import Float
+from gsx.core.training.regenerator import RegeneratorContext, Request
+from gsx.regenerators.pretrained.model_files import RUNNERS, Model, locate_models
+from gsx.regenerators.pretrained.options import PretrainedOptions
+from gsx.regenerators.pretrained.photo_store import PhotoStore
+from gsx.regenerators.pretrained.process import NetworkProcess
+from gsx.regenerators.pretrained.tiles import run_in_tiles
+
+MOST_PASSES = 4
+"""Most networks that are applied one after the other."""
+TRIAL = 24
+"""Side of the picture that each network is tried with before training, px."""
+
+
+class Pretrained:
+    """Enlargement by pretrained networks, one after the other where no single one has the scale."""
+
+    def __init__(self, options: PretrainedOptions) -> None:
+        self.options = options
+        self.process = NetworkProcess(options.vulkan)
+        self.photos = PhotoStore(options.photos_gb, self.enlarge, self.recipe)
+        self.located: dict[int, Model] | None = None
+
+    @property
+    def models(self) -> dict[int, Model]:
+        """Networks by scale, located once; errors as `locate_models`."""
+        if self.located is None:
+            self.located = locate_models(self.options, f"regenerator {self.options.name}: ROLE")
+        return self.located
+
+    def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
+        """Raises ConfigError or InputError if a scale cannot be reached, or a network is missing or unusable."""
+        needed = {factor for scale in scales for factor in factors_of(scale, self.models, self.options.name)}
+        if not needed and max(scales) == 1:
+            raise ConfigError(f"regenerator {self.options.name} has no network of scale 1: give x1.file")
+        for factor in sorted(needed):
+            self.try_network(self.models[factor])
+
+    def try_network(self, model: Model) -> None:
+        """Raises ConfigError if a network fails on a grey picture or has another scale; InputError: it cannot run."""
+        image = torch.full((3, TRIAL, TRIAL), 0.5)
+        result = self.process.run(model.file, image.numpy())
+        shape = tuple(result.shape)
+        if len(shape) != 3 or shape[0] != 3 or shape[1] != shape[2] or shape[1] % TRIAL:
+            raise ConfigError(f"{model.file} makes {shape} of (3, {TRIAL}, {TRIAL}): give a network for RGB pictures")
+        if shape[1] != model.scale * TRIAL:
+            raise ConfigError(
+                f"{model.file} enlarges x{shape[1] // TRIAL}: give it as x{shape[1] // TRIAL}.file, not x{model.scale}"
+            )
+
+    def prepare(self, context: RegeneratorContext) -> dict[str, float]:
+        """Writes the origin of the networks to the run folder, and reserves memory for enlarged photos."""
+        self.photos.expect(context.views)
+        path = context.folder / f"{self.options.name}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, json.dumps(self.provenance(), indent=2).encode())
+        return {}
+
+    def provenance(self) -> dict[str, Any]:
+        """Returns package, licence, files and digests of the networks."""
+        package = self.options.package
+        return {
+            "name": self.options.name,
+            "package": f"{package} {version(package)}" if package else "",
+            "licence": self.options.licence,
+            "networks": {
+                f"x{scale}": {"file": model.file.name, "sha256": model.sha256} for scale, model in self.models.items()
+            },
+        }
+
+    def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
+        """Returns each picture `scale` times as large; windows of photos are cut from whole enlarged photos."""
+        return [self.photos.cut(one) if self.photos.has(one) else self.enlarge_request(one) for one in requests]
+
+    def enlarge_request(self, request: Request) -> Float[Tensor, "3 H W"]:
+        """Enlarges the picture of a request."""
+        return self.enlarge(request.image.cpu(), request.scale, request.reduction)
+
+    def enlarge(self, image: Float[Tensor, "3 h w"], scale: int, reduction: Reduction) -> Float[Tensor, "3 H W"]:
+        """Enlarges a picture by one network after the other, and reduces what is too large as the scene does."""
+        factors = factors_of(scale, self.models, self.options.name)
+        for factor in factors:
+            image = self.run(self.models[factor], image)
+        excess = math.prod(factors) // scale
+        return reduction.reduce(image, excess) if excess > 1 else image
+
+    def run(self, model: Model, image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 H W"]:
+        """Runs one network on a picture."""
+        network = partial(self.process.run, model.file)
+        picture = image.numpy().astype("float32")
+        return torch.from_numpy(run_in_tiles(network, picture, model.scale, self.options.tile, self.options.border))
+
+    def recipe(self) -> object:
+        """Returns all that decides the pixels of an enlarged picture, but the picture."""
+        networks = {scale: model.sha256 for scale, model in self.models.items()}
+        runners = sorted({RUNNERS[model.file.suffix][0] for model in self.models.values()})
+        return networks, self.options.tile, self.options.border, [(name, version(name)) for name in runners]
+
+
+def factors_of(scale: int, available: Iterable[int], name: str) -> tuple[int, ...]:
+    """Returns the networks to apply in turn: the fewest whose product is the scale, else its least multiple.
+
+    Empty for scale 1 without a network of that scale: pictures stay as they are.
+
+    Raises:
+        ConfigError: no multiple can be reached.
+    """
+    scales = sorted(available, reverse=True)
+    if scale == 1:
+        return (1,) if 1 in scales else ()
+    larger = [one for one in scales if one > 1]
+    chains = [c for n in range(1, MOST_PASSES + 1) for c in itertools.combinations_with_replacement(larger, n)]
+    reached = [chain for chain in chains if math.prod(chain) % scale == 0]
+    if not reached:
+        have = ", ".join(f"x{one}" for one in sorted(scales)) or "none"
+        raise ConfigError(
+            f"regenerator {name} cannot enlarge x{scale} by its networks ({have}): change the augmenter's scales"
+        )
+    return min(reached, key=lambda chain: (math.prod(chain), len(chain)))
