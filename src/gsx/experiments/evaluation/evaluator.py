@@ -8,8 +8,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,6 +27,7 @@ from gsx.experiments.evaluation.evaluated_renders import EvaluatedRenders
 from gsx.experiments.evaluation.lpips import load_lpips
 from gsx.experiments.evaluation.protocol import protocol_of
 from gsx.experiments.evaluation.remarks import NOT_MEASURED, gathered, module_remarks, module_summaries
+from gsx.experiments.evaluation.zoomed import Drawing, Zoomed
 from gsx.experiments.run_folder.files import DETAIL_OF
 
 
@@ -58,38 +58,6 @@ def group_figures(views: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     """Returns means over the views of a group."""
     keys = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips", "visible_primitives": "visible"}
     return {name: mean([view[key] for view in views]) for name, key in keys.items()}
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Zoomed:
-    """A view at a zoom: truth, render, and the x1 render enlarged, as they are measured."""
-
-    view: View
-    factor: float
-    truth: Float[Tensor, "3 H W"]
-    render: Float[Tensor, "3 H W"]
-    enlarged: Float[Tensor, "3 H W"]
-    photograph: Float[Tensor, "3 H W"]
-    """The truth at the training resolution, enlarged: the best picture without new detail."""
-    counted: Bool[Tensor, "H W"] | None = None
-    """Pixels that count, None: all; pixels outside of masks are black in every picture."""
-
-
-@runtime_checkable
-class Drawing(Protocol):
-    """Receiver of pictures during evaluation; views are counted as in `scene.test`."""
-
-    def choose(self, figures: Sequence[dict[str, Any]]) -> None:
-        """Receives the figures of all views at the training resolution, before the first picture."""
-        ...
-
-    def whole(self, number: int, view: View, render: Float[Tensor, "3 H W"]) -> None:
-        """Receives a view at the training resolution."""
-        ...
-
-    def zoomed(self, number: int, zoomed: Zoomed) -> None:
-        """Receives the same view at another zoom; all of its zooms come before the next view."""
-        ...
 
 
 Advance = Callable[[float, str], None]

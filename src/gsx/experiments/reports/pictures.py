@@ -20,7 +20,7 @@ from gsx.core.data.window import Window
 from gsx.core.files import write_json
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Bool, Float
-from gsx.experiments.evaluation.evaluator import Zoomed
+from gsx.experiments.evaluation.zoomed import Zoomed
 
 DRAWN_VIEWS = 6
 """Test views that are drawn."""
@@ -50,7 +50,7 @@ ERROR_COLOURS = (
 
 
 class Pictures:
-    """Pictures of up to DRAWN_VIEWS views and their zoomed crops, with an index (implements `evaluator.Drawing`)."""
+    """Pictures of up to DRAWN_VIEWS views and their zoomed crops, with an index (implements `zoomed.Drawing`)."""
 
     def __init__(self, folder: Path, step: int) -> None:
         self.folder, self.step = folder, step

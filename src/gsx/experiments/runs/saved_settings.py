@@ -13,7 +13,7 @@ from gsx.core.plugins import Plugins
 from gsx.core.rasterizer import RasterOptions
 from gsx.core.rasterizer.settings import OF_BACKBONES
 from gsx.core.training.run import TrainingOptions
-from gsx.experiments.evaluation.evaluator import EvalOptions
+from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.run_folder.files import part
 from gsx.experiments.run_folder.general_options import GeneralOptions
