@@ -11,23 +11,24 @@ from gsx.builtin import plugins
 from gsx.core.data.scene import Scene
 from gsx.experiments.runs.compose import compose
 from gsx.scenes import room
+from gsx.scenes.demo import cameras
 from gsx.scenes.demo import views as demo
 from gsx.scenes.demo.still_life import make_still_life
 from gsx.scenes.demo.tracing import camera_rays, rays_through, render, shade, trace
-from gsx.scenes.demo.views import DemoOptions
+from gsx.scenes.demo.views import RayCastOptions
 
 SMALL = ("scene=room", "scene.width=64", "scene.height=48", "scene.train_views=12", "scene.test_views=3")
 
 
 @pytest.fixture(scope="module")
-def options() -> DemoOptions:
+def options() -> RayCastOptions:
     chosen = compose([*SMALL, "scene.points=400", "scene.samples=1"], plugins()).scene.options
-    assert isinstance(chosen, DemoOptions)
+    assert isinstance(chosen, RayCastOptions)
     return chosen
 
 
 @pytest.fixture(scope="module")
-def scene(options: DemoOptions) -> Scene:
+def scene(options: RayCastOptions) -> Scene:
     return room.load(options)
 
 
@@ -40,7 +41,9 @@ def test_cameras_stand_in_the_room_and_test_cameras_between_the_others(scene: Sc
     assert not {view.name for view in scene.train} & {view.name for view in scene.test}
 
 
-def test_points_lie_on_surfaces_with_pattern_and_hardly_any_on_plain_walls(scene: Scene, options: DemoOptions) -> None:
+def test_points_lie_on_surfaces_with_pattern_and_hardly_any_on_plain_walls(
+    scene: Scene, options: RayCastOptions
+) -> None:
     points = scene.points.positions
     assert 100 < len(points) <= 400
     inner = torch.stack([points[:, 0].abs() - room.HALF[0], points[:, 1].abs() - room.HALF[1]]).amax(0)
@@ -79,7 +82,7 @@ def test_the_walls_are_plain_in_the_shade() -> None:
         assert torch.equal(thing.texture(local, local, made.kit), torch.tensor(room.PLASTER)[:, None].expand(3, 50))
 
 
-def test_somebody_stands_in_the_room_before_every_camera(options: DemoOptions) -> None:
+def test_somebody_stands_in_the_room_before_every_camera(options: RayCastOptions) -> None:
     """Not behind a wall: each photograph shows them, but for what hides them."""
     options = replace(options, points=20)
     walked, empty = room.load(replace(options, passer_by=True)), room.load(options)
@@ -115,7 +118,7 @@ GREY = {
 def test_pictures_are_those_of_their_version(kind: ModuleType) -> None:
     """Where this fails on purpose, protocols and the cache need another VERSION of the scene."""
     life = make_still_life() if kind is demo else room.make_room()
-    camera = demo.spiral_camera(0.1, 64, 48) if kind is demo else room.walking_camera(0.1, 64, 48)
+    camera = cameras.spiral_camera(0.1, 64, 48) if kind is demo else room.walking_camera(0.1, 64, 48)
     grey = avg_pool2d(render(life, camera, 3).float(), 8).mean(0)
     assert (grey - torch.tensor(GREY[kind])).abs().max() < 1
     assert {demo: "e26aec382d8f4c08", room: "7491cb90a50661ce"}[kind] == kind.VERSION

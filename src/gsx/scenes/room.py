@@ -16,12 +16,13 @@ from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene
 from gsx.core.shapes import Float
 from gsx.scenes.demo import textures
+from gsx.scenes.demo.cameras import even_cameras
 from gsx.scenes.demo.noise import blend
 from gsx.scenes.demo.solids import box, cylinder, double, sphere
 from gsx.scenes.demo.still_life import SEED, StillLife, Thing, arrange
 from gsx.scenes.demo.textures import Kit, between, edge_distance, make_kit, parity, plain, rgb, smoothstep
 from gsx.scenes.demo.tracing import colours_of, points_at
-from gsx.scenes.demo.views import DemoOptions, check, random_places, scene_along
+from gsx.scenes.demo.views import RayCastOptions, check, random_places, scene_of, size_of
 
 HALF = (2.5, 2.0)  # of the floor, scene units: about metres
 HEIGHT, THICK = 2.4, 0.1  # of the walls
@@ -127,7 +128,8 @@ def found_points(room: StillLife, cameras: Sequence[Camera], count: int, generat
     return PointCloud(positions[chosen].contiguous(), (colours[chosen] * 255.0 + 0.5).to(torch.uint8))
 
 
-def load(options: DemoOptions) -> Scene:
+def load(options: RayCastOptions) -> Scene:
     """Return the room, whose pictures are rendered at first use; ConfigError: see `check`."""
     check(options)
-    return scene_along(options, make_room(), walking_camera, found_points, "room", VERSION, "a walk", floor=FLOOR)
+    cameras = even_cameras(walking_camera, "a walk", options.train_views, options.test_views, size_of(options))
+    return scene_of(options, make_room(), cameras, found_points, "room", VERSION, floor=FLOOR)

@@ -146,6 +146,10 @@ def test_a_composition_is_named_by_what_is_trained_alone() -> None:
         newer = compositions.settings(["scene=colmap", "scene.path=a"]).resolved
         before = {name: value for name, value in newer["scene"].items() if name != "model"}
         assert comparable(newer) == comparable({**newer, "scene": before})
+        demo = compositions.settings(["scene=demo"])
+        older = {name: value for name, value in demo.resolved["scene"].items() if name != "distances"}
+        assert composition_key({**demo.resolved, "scene": older}, "", demo.idle) == key("scene.distances=even") == plain
+        assert key("scene.distances=mixed") != plain
         assert key("scene=colmap", "scene.path=a", "scene.model=auto") == key("scene=colmap", "scene.path=a")
         assert key("scene=colmap", "scene.path=a", "scene.model=sparse/1") != key("scene=colmap", "scene.path=a")
     config, idle = settings.resolved, settings.idle

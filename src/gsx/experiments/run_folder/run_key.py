@@ -23,7 +23,7 @@ EVALUATION = ("eval", "metrics")
 """Keys that matter only after training."""
 PICTURES = (".webp", ".png")
 """Suffixes of an unbundled SOG's pictures."""
-UNCHANGED = {"scene.model": "auto"}
+UNCHANGED = {"scene.model": "auto", "scene.distances": "even"}
 """Keys newer than the first digests, with their neutral values, which do not count."""
 
 

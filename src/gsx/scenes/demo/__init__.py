@@ -1,5 +1,5 @@
 """The built-in scene: a small garden still life, ray-cast in closed form, with exact truth at any zoom and crop."""
 
-from gsx.scenes.demo.views import DemoOptions, DemoSource, load
+from gsx.scenes.demo.views import DemoOptions, DemoSource, RayCastOptions, load
 
-__all__ = ["DemoOptions", "DemoSource", "load"]
+__all__ = ["DemoOptions", "DemoSource", "RayCastOptions", "load"]

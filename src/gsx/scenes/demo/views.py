@@ -1,7 +1,7 @@
-"""The built-in scene as data: cameras on a spiral, pictures rendered on demand, points on visible surfaces."""
+"""The built-in scenes as data: pictures rendered on demand, points on visible surfaces."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera, look_at
+from gsx.core.data.camera import Camera
 from gsx.core.data.images import ImageCache
 from gsx.core.data.resize import training_size
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
@@ -19,24 +19,20 @@ from gsx.core.ranges import Points, Range, Seed
 from gsx.core.shapes import Float, UInt8
 from gsx.engine.cache import cache_folder, content_key
 from gsx.engine.cached_images import cache_image, read_cached_image
+from gsx.scenes.demo.cameras import DISTANCES, Cameras, even_cameras, mixed_cameras, spiral_camera
 from gsx.scenes.demo.passer_by import with_passer_by
 from gsx.scenes.demo.still_life import StillLife, make_still_life
 from gsx.scenes.demo.tracing import colours_of, points_at, render
-from gsx.scenes.options import SceneOptions
+from gsx.scenes.options import SceneOptions, refuse_other
 from gsx.scenes.splits import parse_rule
 
-TARGET = (0.0, 0.05, 0.50)  # every camera looks here
-FIELD_OF_VIEW = math.radians(50.0)  # horizontal
-TURNS = 3.0  # of the spiral
-ELEVATION = (math.radians(8.0), math.radians(46.0))  # at its beginning and its end
-DISTANCE, SWAY, SWAYS = 3.3, 0.65, 5.0  # mean distance from the target, its variation, and how often it varies
 SAME = 1e-6  # intrinsics that agree to this many pixels are the same
 VERSION = "e26aec382d8f4c08"  # of the pictures, in protocols and the cache: give another where a pixel changes
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoOptions(SceneOptions):
-    """Options of `conf/scene/demo.yaml`; `path` and options of photographs do not apply.
+class RayCastOptions(SceneOptions):
+    """Options of both built-in scenes; `path` and options of photographs do not apply.
 
     `split=none` trains on test views as well; all other rules mean the test views between training views.
     """
@@ -54,6 +50,19 @@ class DemoOptions(SceneOptions):
     """Seed of the initial points."""
     passer_by: bool = False
     """A person stands before each training camera. The default: runs older than this option."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(RayCastOptions):
+    """Options of `conf/scene/demo.yaml`."""
+
+    distances: str = "even"
+    """even: all cameras at similar distances; mixed: most of them three times as far, one in eight near. The default:
+    runs older than this option."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        refuse_other("distances", self.distances, DISTANCES)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -100,17 +109,6 @@ def camera_key(camera: Camera) -> str:
     return content_key(*pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
 
 
-def spiral_camera(place: float, width: int, height: int) -> Camera:
-    """Return the camera at `place` in [0, 1) of a rising spiral around the scene at varying distance."""
-    azimuth = 2 * math.pi * TURNS * place - math.pi / 2
-    elevation = ELEVATION[0] + (ELEVATION[1] - ELEVATION[0]) * place
-    distance = DISTANCE - SWAY * math.cos(2 * math.pi * SWAYS * place)
-    flat = distance * math.cos(elevation)
-    eye = (flat * math.cos(azimuth), flat * math.sin(azimuth), distance * math.sin(elevation))
-    eye = (TARGET[0] + eye[0], TARGET[1] + eye[1], TARGET[2] + eye[2])
-    return look_at(eye, TARGET, fov_x=FIELD_OF_VIEW, width=width, height=height)
-
-
 def sample_points(life: StillLife, cameras: Sequence[Camera], count: int, generator: torch.Generator) -> PointCloud:
     """Return coloured points where random rays of the cameras meet surfaces and sky, equally many from each."""
     shares = [count // len(cameras) + (index < count % len(cameras)) for index in range(len(cameras))]
@@ -124,7 +122,7 @@ def random_places(camera: Camera, count: int, generator: torch.Generator) -> Flo
     return torch.rand(2, count, generator=generator, dtype=torch.float64) * torch.tensor([camera.size]).T
 
 
-def check(options: DemoOptions) -> None:
+def check(options: RayCastOptions) -> None:
     """Raise ConfigError for options that make no scene: a path or unit, more test than training views, an odd split."""
     parse_rule(options.split)
     if options.path:
@@ -139,43 +137,54 @@ def check(options: DemoOptions) -> None:
         raise ConfigError(f"{views}: set at most as many, as test cameras stand between training cameras.")
 
 
-def make_views(group: str, cameras: Sequence[Camera], source: Callable[[str, Camera], DemoSource]) -> list[View]:
-    """Return numbered views, each with its own source."""
-    named = {f"{group}_{index:03d}": camera for index, camera in enumerate(cameras)}
-    return [View(name, camera, source(name, camera)) for name, camera in named.items()]
+def make_views(
+    prefix: str, cameras: Mapping[str, Sequence[Camera]], source: Callable[[str, Camera], DemoSource]
+) -> list[View]:
+    """Return numbered views of cameras by group, each with its own source."""
+    listed = [(camera, group) for group, members in cameras.items() for camera in members]
+    names = [f"{prefix}_{index:03d}" for index in range(len(listed))]
+    return [
+        View(name, camera, source(name, camera), group) for name, (camera, group) in zip(names, listed, strict=True)
+    ]
 
 
 def load(options: DemoOptions) -> Scene:
     """Return the built-in scene, whose pictures are rendered at first use; ConfigError: see `check`."""
     check(options)
-    return scene_along(options, make_still_life(), spiral_camera, sample_points, "demo", VERSION, "a spiral")
+    cameras = cameras_of(options)
+    return scene_of(options, make_still_life(), cameras, sample_points, "demo", VERSION)
 
 
-CameraAt = Callable[[float, int, int], Camera]
-"""(place in [0, 1) of a path, width, height) -> the camera there."""
+def cameras_of(options: DemoOptions) -> Cameras:
+    """Place the cameras around the still life; ConfigError: see `mixed_cameras`."""
+    counts, size = (options.train_views, options.test_views), size_of(options)
+    if options.distances == "mixed":
+        return mixed_cameras(*counts, size)
+    return even_cameras(spiral_camera, "a spiral", *counts, size)
+
+
+def size_of(options: RayCastOptions) -> tuple[int, int]:
+    """Return (width, height) of training pictures, px."""
+    return training_size(options.width, options.height, options.downscale, options.max_width)
+
+
 PointsOf = Callable[[StillLife, Sequence[Camera], int, torch.Generator], PointCloud]
 """(things, cameras, count, generator) -> initial points."""
 
 
-def scene_along(
-    options: DemoOptions,
+def scene_of(
+    options: RayCastOptions,
     life: StillLife,
-    camera_at: CameraAt,
+    cameras: Cameras,
     points: PointsOf,
     name: str,
     version: str,
-    path: str,
     floor: float = 0.0,
 ) -> Scene:
-    """Place training cameras evenly along a path, and test cameras half-way between neighbours.
+    """Return the scene of things and cameras.
 
-    name, version: of the format and its cached pictures; path: name of the path; floor: its height, scene units.
+    name, version: of the format and its cached pictures; floor: its height, scene units.
     """
-    size = training_size(options.width, options.height, options.downscale, options.max_width)
-    count = options.train_views
-    train = [camera_at(index / count, *size) for index in range(count)]
-    places = [(index * count // options.test_views + 0.5) / count for index in range(options.test_views)]
-    test = [camera_at(place, *size) for place in places]
     cache = ImageCache(int(options.cache_gb * 1e9))
 
     def source(view: str, camera: Camera, somebody: bool) -> DemoSource:
@@ -184,9 +193,9 @@ def scene_along(
         folder = cache_folder(name, content_key(version, options.samples, *who))
         return DemoSource(life=things, own=camera, samples=options.samples, cache=cache, folder=folder)
 
-    train_views = make_views("train", train, partial(source, somebody=options.passer_by))
-    test_views = make_views("test", test, partial(source, somebody=False))
-    every = options.split == "none"
+    train_views = make_views("train", cameras.train, partial(source, somebody=options.passer_by))
+    test_views = make_views("test", cameras.test, partial(source, somebody=False))
+    train, every = [view.camera for view in train_views], options.split == "none"
     return Scene(
         name=options.name,
         train=[*train_views, *test_views] if every else train_views,
@@ -195,19 +204,18 @@ def scene_along(
         background=torch.tensor(options.background),
         extent=extent_of(train),
         notes=["somebody stands before each training camera (scene.passer_by)"] if options.passer_by else [],
-        provenance=provenance(options, size, name, version, path),
+        provenance=provenance(options, name, version, cameras.split),
     )
 
 
-def provenance(options: DemoOptions, size: tuple[int, int], name: str, version: str, path: str) -> dict[str, Any]:
-    """Return everything that decides the pictures, for the evaluation protocol."""
+def provenance(options: RayCastOptions, name: str, version: str, split: str) -> dict[str, Any]:
+    """Return everything that decides the pictures, for the evaluation protocol; `split`: of its cameras."""
     somebody = {"passer_by": True} if options.passer_by else {}
     return somebody | {
         "format": name,
         "version": version,
-        "size": list(size),
+        "size": list(size_of(options)),
         "samples": options.samples,
         "light": "display",
-        "split": f"{options.train_views} on {path}, {options.test_views} between them"
-        + (", all trained on" if options.split == "none" else ""),
+        "split": split + (", all trained on" if options.split == "none" else ""),
     }
