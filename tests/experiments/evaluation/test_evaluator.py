@@ -165,6 +165,17 @@ def test_a_zoom_is_compared_with_its_truth_and_with_the_enlarged_render(figures:
     assert (found["views"], found["beats_enlarged"]) == (2, True)
 
 
+def test_zooms_have_means_of_each_group_with_truth(figures: dict[str, Any]) -> None:
+    """Near views have truth at x2, the far one has none; at x1 it is its own enlargement."""
+    found, own = figures["zoom"]["2"]["groups"], figures["zoom"]["1"]["groups"]
+    assert list(found) == ["near"]
+    assert found["near"] == {key: value for key, value in figures["zoom"]["2"].items() if key != "groups"}
+    assert list(own) == ["far", "near"]
+    assert (own["far"]["psnr"], own["far"]["views"]) == (close(decibels(50)), 1)
+    assert (own["near"]["psnr"], own["near"]["beats_enlarged"]) == (close(decibels(10, 20)), None)
+    assert "groups" not in figures["zoom"]["8"]
+
+
 def test_the_other_zooms(figures: dict[str, Any]) -> None:
     """At x1 the render is its own enlargement; finer than all photographs there is nothing to compare with."""
     own = figures["zoom"]["1"]

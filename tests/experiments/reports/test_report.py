@@ -75,7 +75,7 @@ def evaluation(**changes: Any) -> dict[str, Any]:
         "groups": {"near": {"psnr": 24.25, "ssim": 0.9, "lpips": None}},
         "zoom": {
             "1": zoom_entry(24.25, 24.25),
-            "2": zoom_entry(23.5, 23.0),
+            "2": zoom_entry(23.5, 23.0) | {"groups": {"near": zoom_entry(23.25, 23.0)}},
             "4": zoom_entry(20.0, 21.5),
             "8": {"unavailable": "the images hold no truth at x8"},
         },
@@ -259,6 +259,8 @@ def test_schedule_notes_protocol_and_configuration(page: Page) -> None:
     assert "0123456789abcdef" in page.text("protocol")
     assert "sh_degree: 3" in page.texts["settings"]
     assert "near 24.25" in page.text("worst") + page.text("groups")
+    assert "PSNR at ×2, dB" in page.source
+    assert "near 24.25 0.9000 n/a 23.25" in page.text("groups") + page.text("worst")
 
 
 def test_an_interrupted_run_says_what_is_missing_and_how_to_go_on(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -168,23 +168,23 @@ class Evaluator:
         """Returns mean figures at each zoom from those of `views` at x1; sends each picture to `drawing`."""
         if not views:
             return {f"{factor:g}": {"unavailable": NOT_MEASURED} for factor in self.options.zoom}
-        found: dict[float, list[dict[str, float]]] = {factor: [] for factor in self.options.zoom}
-        details: dict[float, list[Details]] = {factor: [] for factor in self.options.zoom}
+        found: dict[float, list[ZoomFigures]] = {factor: [] for factor in self.options.zoom}
         for number, (view, own) in enumerate(zip(self.run.scene.test, views, strict=True)):
             if drawing is not None:
                 drawing.whole(number, view, self.whole(view))
             for factor, figures in found.items():
                 if factor == 1:  # nothing is enlarged
-                    figures.append({kind + key: own[key] for kind in ("", "enlarged_") for key in ("psnr", "ssim")})
+                    same = {kind + key: own[key] for kind in ("", "enlarged_") for key in ("psnr", "ssim")}
+                    figures.append(ZoomFigures(view.group, same, {}))
                 elif zoomed := self.zoomed(view, factor):
-                    figures.append(self.zoom_figures(zoomed))
                     pictures = {name: getattr(zoomed, name) for name in DETAIL_OF}
                     whole = zoomed.counted is None  # the border of a mask would be detail
-                    details[factor].append(details_of(pictures, zoomed.truth, factor) if whole else {})
+                    details = details_of(pictures, zoomed.truth, factor) if whole else {}
+                    figures.append(ZoomFigures(view.group, self.zoom_figures(zoomed), details))
                     if drawing is not None:
                         drawing.zoomed(number, zoomed)
                     advance(factor**2, f"{view.name} x{factor:g}")
-        return {f"{factor:g}": zoom_entry(factor, figures, details[factor]) for factor, figures in found.items()}
+        return {f"{factor:g}": zoom_result(factor, figures) for factor, figures in found.items()}
 
     def frames_per_second(self) -> float | None:
         """Return renders per second at the training resolution, without the first, which warms up; None: none was."""
@@ -230,15 +230,31 @@ class Evaluator:
         return evaluation | module_remarks(run, evaluation)
 
 
-def zoom_entry(factor: float, figures: Sequence[dict[str, float]], details: Sequence[Details]) -> dict[str, Any]:
-    """Returns mean figures at one zoom with the verdict, or the reason why there are none."""
-    if not figures:
+class ZoomFigures(NamedTuple):
+    """Figures of one view at one zoom."""
+
+    group: str
+    figures: dict[str, float]
+    details: Details
+    """Empty: not measured."""
+
+
+def zoom_result(factor: float, views: Sequence[ZoomFigures]) -> dict[str, Any]:
+    """Returns mean figures at one zoom over all views, and over those of each group if there are groups."""
+    groups = sorted({view.group for view in views if view.group})
+    of_groups = {name: zoom_entry(factor, [view for view in views if view.group == name]) for name in groups}
+    return zoom_entry(factor, views) | ({"groups": of_groups} if groups else {})
+
+
+def zoom_entry(factor: float, views: Sequence[ZoomFigures]) -> dict[str, Any]:
+    """Returns mean figures of views at one zoom with the verdict, or the reason why there are none."""
+    if not views:
         return {"unavailable": f"the images hold no truth at x{factor:g}: train on a larger scene.downscale"}
-    means = {key: statistics.fmean(f[key] for f in figures) for key in figures[0]}
+    means = {key: statistics.fmean(view.figures[key] for view in views) for key in views[0].figures}
     gain = means["psnr"] - means["enlarged_psnr"]
-    known = [detail for detail in details if detail]
+    known = [view.details for view in views if view.details]
     found = {name: explained([detail[name] for detail in known]) for name in known[0]} if known else {}
-    verdict = {"views": len(figures), "beats_enlarged": None if factor == 1 else gain > 0}
+    verdict = {"views": len(views), "beats_enlarged": None if factor == 1 else gain > 0}
     return means | verdict | ({"detail": found} if found else {})
 
 

@@ -100,6 +100,7 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "evaluation": evaluation,
         "protocol": part(evaluation, "protocol"),
         "groups": part(evaluation, "groups"),
+        "zoom_groups": zoom_groups(zoom),
         "scene": part(run.environment, "scene"),
         "plan": part(run.environment, "plan"),
         "remarks": remarks_of(evaluation),
@@ -148,6 +149,15 @@ def zoom_rows(evaluation: dict[str, Any]) -> list[dict[str, Any]]:
             "detail": {kind: detail_share(entry, kind) for kind in DETAIL_OF},
         }
         for factor, entry in sorted(part(evaluation, "zoom").items(), key=lambda item: float(item[0]))
+    ]
+
+
+def zoom_groups(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Returns PSNR of each group by zoom, without x1 and zooms that have none."""
+    return [
+        {"factor": row["factor"], "psnr": {name: part(groups, name).get("psnr") for name in groups}}
+        for row in rows
+        if row["factor"] != "1" and (groups := part(row["entry"], "groups"))
     ]
 
 
