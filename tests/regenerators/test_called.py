@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ from torch import Tensor
 
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
+from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.reduction import as_blocks
+from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, TrainingError
 from gsx.experiments.runs.job import train
 from gsx.regenerators.called import Called, CalledOptions
@@ -29,12 +32,13 @@ def blocks(image: Tensor, *, scale: int, prompt: str, seed: int, strength: float
 
 
 def test_a_function_redraws_the_views_of_a_run(tmp_path: Path) -> None:
-    """It is told the prompt, with the name of the scene."""
+    """It receives the prompt, with the name of the scene; an empty one in the trial before training."""
     PROMPTS.clear()
     words = [*SMALL, "augmenter=upscale", "augmenter.upscale.prompt='{scene}, sharp'"]
     words += ["regenerator/upscale=callable", "regenerator.upscale.function=test_called:blocks"]
     tiny_run(tmp_path / "run", words)
-    assert set(PROMPTS) == {"demo, sharp"}
+    assert set(PROMPTS) == {"", "demo, sharp"}
+    assert PROMPTS[:2] == ["", ""]
     made = json.loads((tmp_path / "run" / "pseudo" / "index.json").read_text())["views"]
     assert made
     assert all(view["consistent"] == 1 for view in made if view["scale"] == 2)
@@ -116,6 +120,95 @@ def test_what_is_no_function_is_refused(function: str) -> None:
     """Before training."""
     with pytest.raises(ConfigError, match=f"function(=| is ').*{function}"):
         Called(CalledOptions(name="callable", function=function, arguments={})).check([], [2], False)
+
+
+SHAPES: list[tuple[int, ...]] = []
+
+
+def doubled(image: Tensor, *, scale: int, prompt: str, seed: int, strength: float) -> Tensor:
+    """A network that only doubles."""
+    SHAPES.append((scale, *image.shape[1:]))
+    return as_blocks(image, 2)
+
+
+def failing(image: Tensor, *, scale: int, prompt: str, seed: int, strength: float) -> Tensor:
+    raise RuntimeError("scale 1 has no weights\nin this folder")
+
+
+def infinite(image: Tensor, *, scale: int, prompt: str, seed: int, strength: float) -> Tensor:
+    image[0, 0, :3] = torch.inf
+    return as_blocks(image, scale)
+
+
+def bytes_of(image: Tensor, *, scale: int, prompt: str, seed: int, strength: float) -> Tensor:
+    return (as_blocks(image, scale) * 255).to(torch.uint8)
+
+
+def nothing(image: Tensor, **_: object) -> None:
+    torch.rand(1)
+
+
+@dataclass(frozen=True)
+class Grey:
+    """A photograph of one grey."""
+
+    def image(self, camera: Camera) -> Tensor:
+        return torch.full((3, camera.height, camera.width), 100, dtype=torch.uint8)
+
+    def max_zoom(self, camera: Camera) -> float:
+        return 1.0
+
+
+def view(width: int, height: int) -> View:
+    camera = look_at((0.0, -3.0, 1.0), (0.0, 0.0, 0.0), fov_x=0.9, width=width, height=height)
+    return View("first", camera, Grey())
+
+
+def called(function: str) -> Called:
+    return Called(CalledOptions(name="callable", function=f"test_called:{function}", arguments={}))
+
+
+LEAVE_OUT = r"augmenter\.NAME\.scales=\[2\] leaves out 1, or return the image itself for scale=1$"
+
+
+@pytest.mark.parametrize(("function", "scales", "words"), [
+    ("doubled", [1, 2], r"scale=1 returned a tensor \[3, 128, 96\], not \[3, 64, 48\]: " + LEAVE_OUT),
+    ("doubled", [2, 4], r"scale=4 .*\[3, 256, 192\].*scales=\[2\] leaves out 4, or correct .* scale=4$"),
+    ("failing", [1, 2], r"scale=1 raised RuntimeError: scale 1 has no weights: " + LEAVE_OUT),
+    ("infinite", [1], r"scale=1 returned 3 values that are not finite: return the image itself for scale=1$"),
+    ("bytes_of", [2], r"scale=2 returned uint8, not display values in \[0, 1\]: correct the function for scale=2$"),
+    ("nothing", [1, 2], r"scale=1 returned NoneType, not a tensor \[3, 64, 48\]: " + LEAVE_OUT),
+])  # fmt: skip
+def test_a_function_that_fails_at_a_scale_is_refused_before_training(
+    function: str, scales: list[int], words: str
+) -> None:
+    with pytest.raises(ConfigError, match=f"test_called:{function} tried with {words}"):
+        called(function).check([view(48, 90)], scales, False)
+
+
+def test_a_function_is_tried_on_a_part_of_the_first_view_without_a_trace() -> None:
+    """64 px wide and high at most, smaller views whole; numbers and pictures of training stay as they are."""
+    SHAPES.clear()
+    first = view(100, 70)
+    for one in (first, view(40, 30)):
+        called("doubled").check([one, view(8, 8)], [2], False)
+    assert SHAPES == [(2, 64, 64), (2, 30, 40)]
+    state = torch.get_rng_state()
+    for function in ("nothing", "infinite"):
+        with pytest.raises(ConfigError):
+            called(function).check([first], [1], False)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert bool((first.image() == 100 / 255).all())
+
+
+def test_a_run_with_a_function_that_only_doubles_ends_before_its_first_step(tmp_path: Path) -> None:
+    words = [*SMALL, "augmenter=upscale", "regenerator/upscale=callable"]
+    words += ["regenerator.upscale.function=test_called:doubled"]
+    with pytest.raises(ConfigError, match="scale=1 returned a tensor"):
+        tiny_run(tmp_path / "both", words)
+    assert not (tmp_path / "both" / "metrics.jsonl").exists()
+    run = tiny_run(tmp_path / "doubled", [*words, "augmenter.upscale.scales=[2]"])
+    assert run.step == 12
 
 
 def test_a_function_beside_the_user_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

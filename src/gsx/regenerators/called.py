@@ -8,13 +8,17 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from gsx.core.data.scene import View
-from gsx.core.errors import ConfigError
+from gsx.core.errors import ConfigError, first_line
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import Request
 from gsx.regenerators.classical import Fixed
+
+TRIAL = 64
+"""Largest side of the picture that a function is tried on before training, px."""
 
 
 @contextmanager
@@ -49,8 +53,25 @@ class Called(Fixed):
     options: CalledOptions
 
     def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
-        """Raise ConfigError if the function cannot be imported."""
-        self.function()
+        """Raise ConfigError if the function cannot be imported, or fails on a part of the first view at a scale."""
+        function = self.function()
+        for scale in scales if views else []:
+            problem = self.problem(function, trial_picture(views[0]), scale)
+            if problem:
+                raise ConfigError(
+                    f"regenerator callable: {self.options.function} tried with scale={scale} {problem}: "
+                    + remedy(scale, [other for other in scales if other != scale])
+                )
+
+    def problem(self, function: Callable[..., Tensor], image: Float[Tensor, "3 h w"], scale: int) -> str:
+        """Call the function once, and return what is wrong with its result; empty: nothing."""
+        try:
+            with torch.random.fork_rng(devices=[]):  # a trial leaves the numbers of training as they are
+                result = function(image, scale=scale, prompt="", seed=0, strength=0.0, **self.options.arguments)
+        except Exception as error:  # a user's function may raise anything
+            return f"raised {type(error).__name__}: {first_line(error)}"
+        height, width = image.shape[1:]
+        return defect(result, (3, scale * height, scale * width))
 
     def function(self) -> Callable[..., Tensor]:
         """Import the function."""
@@ -75,3 +96,31 @@ class Called(Fixed):
             function(r.image, scale=r.scale, prompt=r.prompt, seed=r.seed, strength=r.strength, **more)
             for r in requests
         ]
+
+
+def trial_picture(view: View) -> Float[Tensor, "3 h w"]:
+    """Cut the middle of a photo, TRIAL px wide and high at most."""
+    image = view.image()
+    height, width = (min(side, TRIAL) for side in image.shape[1:])
+    top, left = (image.shape[1] - height) // 2, (image.shape[2] - width) // 2
+    return image[:, top : top + height, left : left + width].clone()
+
+
+def defect(result: Any, shape: tuple[int, int, int]) -> str:
+    """Return in which way a result is no picture of that shape; empty: it is one."""
+    if not isinstance(result, Tensor):
+        return f"returned {type(result).__name__}, not a tensor {list(shape)}"
+    if result.shape != shape:
+        return f"returned a tensor {list(result.shape)}, not {list(shape)}"
+    if not result.is_floating_point():
+        return f"returned {str(result.dtype).removeprefix('torch.')}, not display values in [0, 1]"
+    if not bool(result.isfinite().all()):
+        return f"returned {int((~result.isfinite()).sum())} values that are not finite"
+    return ""
+
+
+def remedy(scale: int, others: Sequence[int]) -> str:
+    """Return what to do about a scale at which the function fails; `others`: further scales of the augmenter."""
+    ways = [f"augmenter.NAME.scales={list(others)} leaves out {scale}"] if others else []
+    ways.append("return the image itself for scale=1" if scale == 1 else f"correct the function for scale={scale}")
+    return ", or ".join(ways)
