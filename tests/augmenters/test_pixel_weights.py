@@ -6,21 +6,22 @@ import pytest
 import torch
 
 from gsx.augmenters.pixel_weights import (
+    SplatSuRe,
     agreeing,
     best_densities,
+    contributes,
     in_bytes,
     normalised,
     sampled_better,
     sampling_scores,
-    splatsure,
     undilated_radii,
-    unscaled_weights,
 )
 from gsx.augmenters.pseudo_options import WEIGHT_MAPS
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.reduction import Reduction
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings
+from gsx.core.training.backbone import DrawnSplats
 
 
 def at(distance: float, width: int = 40, target: float = 0.0) -> Camera:
@@ -56,14 +57,18 @@ def middle(picture: torch.Tensor) -> float:
 @pytest.mark.parametrize(("zoom", "counts"), [(1, False), (2, True), (4, True)])
 def test_a_zoomed_view_counts_unless_a_photograph_came_as_near(zoom: int, counts: bool) -> None:
     raster, own = RasterSettings(), at(4.0)
-    assert (middle(sampled_better(lambda _: wall(), own.zoom(zoom), [own], 0, raster)) > 0.9) == counts
-    assert middle(sampled_better(lambda _: wall(), own.zoom(zoom), [own, at(0.8)], 0, raster)) < 0.1
+    assert (
+        middle(sampled_better(lambda _: DrawnSplats(splats=wall()), own.zoom(zoom), [own], 0, raster)) > 0.9
+    ) == counts
+    assert middle(sampled_better(lambda _: DrawnSplats(splats=wall()), own.zoom(zoom), [own, at(0.8)], 0, raster)) < 0.1
 
 
 def test_only_the_part_that_the_nearer_photograph_shows_does_not_count() -> None:
     """A photograph from 1 unit away sees about a unit of the wall, on the left."""
     own = at(4.0)
-    trust = sampled_better(lambda _: wall(), own.zoom(2), [own, at(1.0, target=-0.6)], 0, RasterSettings())
+    trust = sampled_better(
+        lambda _: DrawnSplats(splats=wall()), own.zoom(2), [own, at(1.0, target=-0.6)], 0, RasterSettings()
+    )
     assert float(trust[36:44, 22:30].mean()) < 0.1
     assert float(trust[36:44, 50:58].mean()) > 0.9
 
@@ -124,15 +129,66 @@ def test_only_training_views_that_see_a_splat_count() -> None:
 def test_the_published_weights_by_hand(distances: tuple[float, ...], published: float, ours: float) -> None:
     """A wall seen from 4 units through twice the focal length, made from the first of these photographs."""
     raster, own, photographs = RasterSettings(), at(4.0).zoom(2), [at(distance) for distance in distances]
-    assert (WEIGHT_MAPS["splatsure"], WEIGHT_MAPS["finer"]) == (splatsure, sampled_better)
-    assert middle(splatsure(lambda _: wall(), own, photographs, 0, raster)) == pytest.approx(published, abs=0.03)
-    assert middle(sampled_better(lambda _: wall(), own, photographs, 0, raster)) == pytest.approx(ours, abs=0.1)
+    made, finer = WEIGHT_MAPS["splatsure"](), WEIGHT_MAPS["finer"]()
+    assert isinstance(made, SplatSuRe)
+    assert finer is sampled_better
+    assert middle(made(lambda _: DrawnSplats(splats=wall()), own, photographs, 0, raster)) == pytest.approx(
+        published, abs=0.03
+    )
+    assert middle(sampled_better(lambda _: DrawnSplats(splats=wall()), own, photographs, 0, raster)) == pytest.approx(
+        ours, abs=0.1
+    )
+
+
+@pytest.mark.parametrize(("number", "weight"), [(0, 0.0474), (1, 0.0474), (2, 1.0)])
+def test_one_opaque_splat_by_hand(number: int, weight: float) -> None:
+    """Ratio 1.25, score 0.9526: 1 - 0.9526 in photos at 5 units, 1 - 0.9526 + 1 clamped in the one at 4."""
+    splats = replace(dots((0.0, 0.0, 0.0), scale=0.3), log_opacities=torch.tensor([0.0]))
+    photographs = [at(distance, width=2000) for distance in (5.0, 5.0, 4.0)]
+    own = photographs[number].crop(999, 999, 2, 2)
+    drawn = DrawnSplats(splats=splats)
+    made = SplatSuRe().unscaled(drawn, own, photographs, number, RasterSettings(alpha_max=0.999))
+    assert float(made.clamp(0, 1).mean()) == pytest.approx(weight, abs=2e-3)
+
+
+def test_a_photograph_shows_no_splat_behind_an_opaque_one_as_published() -> None:
+    """From 1 unit in front the wall hides the ball; only three far photos from behind show it, from one distance."""
+    ball, front = dots((0.0, 0.5, 0.0), scale=0.05), replace(wall(), scales=torch.full((441, 3), 0.12))
+    scene = Splats(**{name: torch.cat([value, getattr(ball, name)]) for name, value in vars(front).items()})
+    behind = look_at([0.0, 4.5, 0.0], [0.0, 0.0, 0.0], fov_x=0.9, width=40, height=40)
+    photographs, raster = [at(1.0), behind, behind, behind], RasterSettings()
+    assert [bool(contributes(scene, camera, raster)[-1]) for camera in photographs[:2]] == [False, True]
+    score, finest = sampling_scores(scene, photographs, raster)
+    assert (float(score[-1]), int(finest[-1])) == (pytest.approx(0.1192, abs=1e-3), 1)
+    score, finest = sampling_scores(scene, photographs, raster, occlusion=False)
+    assert (float(score[-1]), int(finest[-1])) == (pytest.approx(1.0, abs=1e-3), 0)
+    of_rows = DrawnSplats(splats=scene, rows=torch.arange(len(scene)))
+    assert torch.equal(SplatSuRe().sampling(of_rows, photographs, raster).score, score)
+
+
+def test_scores_are_computed_once_for_splats_that_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Again where training has moved a splat in place, or a pose was corrected."""
+    calls = list[int]()
+
+    def counting(*arguments: object, **more: object) -> object:
+        calls.append(1)
+        return sampling_scores(*arguments, **more)
+
+    monkeypatch.setattr("gsx.augmenters.pixel_weights.sampling_scores", counting)
+    weights, splats, photographs = SplatSuRe(), wall(), [at(4.0), at(1.0), at(4.0)]
+    for number in (0, 2):
+        weights(lambda _: DrawnSplats(splats=splats), at(4.0).zoom(2), photographs, number, RasterSettings())
+    assert len(calls) == 1
+    splats.means[0] += 0.01
+    weights.sampling(DrawnSplats(splats=splats), photographs, RasterSettings())
+    weights.sampling(DrawnSplats(splats=splats), [*photographs[:2], at(4.1)], RasterSettings())
+    assert len(calls) == 3
 
 
 def test_where_nothing_is_drawn_the_published_weight_is_1_and_low_maps_are_normalised() -> None:
     near, far = at(1.0), at(4.0)
     dot = dots((0.0, 0.0, 0.0), scale=0.05)
-    weights = splatsure(lambda _: dot, far.zoom(2), [far, near, far], 0, RasterSettings())
+    weights = SplatSuRe()(lambda _: DrawnSplats(splats=dot), far.zoom(2), [far, near, far], 0, RasterSettings())
     assert float(weights[0, 0]) == 1.0
     low = torch.tensor([[0.1, 0.3], [0.5, 0.2]])
     assert normalised(low, 0.1, 0.5).tolist() == [[0.0, pytest.approx(0.5)], [1.0, pytest.approx(0.25)]]
@@ -142,19 +198,19 @@ def test_where_nothing_is_drawn_the_published_weight_is_1_and_low_maps_are_norma
 
 def test_low_maps_are_normalised_by_the_whole_photograph_not_by_the_window() -> None:
     """Everything in the photograph is seen three times as finely by another, by one part less than by the rest."""
-    raster, own = RasterSettings(), at(4.0)
+    raster, own, weights = RasterSettings(), at(4.0), SplatSuRe()
     photographs, asked = [own, at(4.0 / 1.14), own], list[Camera]()
 
-    def drawn(camera: Camera) -> Splats:
+    def drawn(camera: Camera) -> DrawnSplats:
         asked.append(camera)
         return broad
 
-    broad = replace(wall(), scales=torch.full((441, 3), 4.0))
-    low = unscaled_weights(broad, own, photographs, 0, raster)
+    broad = DrawnSplats(splats=replace(wall(), scales=torch.full((441, 3), 4.0)))
+    low = weights.unscaled(broad, own, photographs, 0, raster)
     assert 0 < float(low.max()) < 0.9
     window = own.crop(10, 10, 8, 8)
-    wanted = (unscaled_weights(broad, window, photographs, 0, raster) - low.min()) / (low.max() - low.min())
-    assert torch.allclose(splatsure(drawn, window, photographs, 0, raster), wanted.clamp(0, 1))
+    wanted = (weights.unscaled(broad, window, photographs, 0, raster) - low.min()) / (low.max() - low.min())
+    assert torch.allclose(weights(drawn, window, photographs, 0, raster), wanted.clamp(0, 1))
     assert asked == [window, own]
 
 

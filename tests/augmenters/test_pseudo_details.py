@@ -130,6 +130,23 @@ def test_bootstrapping_takes_its_share_without_a_colour_network_too(tmp_path: Pa
     assert step.terms["own"] == pytest.approx(0.85 * float(own_loss(run, 0).detach()), rel=1e-4)
 
 
+def test_the_published_loss_of_splatsure_weighs_photos_by_0_6(tmp_path: Path) -> None:
+    """0.6 L_o + 0.4 mean W |render - target|: W from the weight map, and a mean over all pixels."""
+    words = ("backbone=gs3d", "augmenter=upscale")
+    published = {"mode": "hybrid", "weights": [0.4, 0.4], "loss": "l1", "gain": 1.0, "scales": [2], "window": "center"}
+    run = run_at(tmp_path / "run", 60, *words, weight_map="splatsure", **published)
+    run.sampler.order = [0]
+    step = backward(run)
+    zero_grad(run.backbone.table)
+    (view,) = augmenter_of(run).views[0]
+    assert view.pixel_weight is not None
+    weights = view.pixel_weight.double() / 255
+    assert 0.02 < float(weights.mean()) < 0.98
+    off = (picture(run, view.camera).detach() - view.target / 255).abs().double()
+    assert step.terms["upscale"] == pytest.approx(0.4 * float((off * weights).sum() / off.numel()), rel=1e-4)
+    assert step.terms["own"] == pytest.approx(0.6 * float(own_loss(run, 0).detach()), rel=1e-4)
+
+
 def test_density_control_counts_what_lies_in_the_window(tmp_path: Path) -> None:
     """Of the window's render, not of the whole zoomed canvas that it is cut from."""
     run = run_at(tmp_path / "run", 44, "augmenter=upscale_paper")

@@ -1,7 +1,7 @@
 """Weights of a pseudo view's pixels: by the resolution of the photos, and by agreement with the input."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import torch
@@ -12,9 +12,10 @@ from gsx.core.data.reduction import Reduction, as_blocks
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, on_screen, rasterize, without_colours
 from gsx.core.rasterizer.boxes import three_sigma
-from gsx.core.shapes import Float, Int, UInt8
+from gsx.core.shapes import Bool, Float, Int, UInt8
+from gsx.core.training.backbone import Drawn
 
-Draw: TypeAlias = Callable[[Camera], Splats]
+Draw: TypeAlias = Callable[[Camera], Drawn]
 """Returns the splats that a camera draws."""
 WeightMap: TypeAlias = Callable[[Draw, Camera, Sequence[Camera], int, RasterSettings], Tensor]
 """(model, camera of the pseudo view, cameras of the photos, number of its photo, rules) -> pixel weights [h, w]."""
@@ -26,26 +27,67 @@ LEAST_PEAK = 0.9
 """Largest weight of a photo below which weights are min-max normalised (SplatSuRe)."""
 
 
-@torch.no_grad()
-def splatsure(
-    drawn: Draw, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
-) -> Float[Tensor, "h w"]:
-    """Returns SplatSuRe's weights (2512.02172): low where another photo shows a surface more finely, else high.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sampling:
+    """Scores of splats by their radii in photos, and what they were computed from."""
 
-    Ours: rendered for the pseudo view instead of rendered for the photo and enlarged.
+    splats: Splats
+    photographs: Sequence[Camera]
+    score: Float[Tensor, "N"]
+    finest: Int[Tensor, "N"]
+    """Number of the photo with the largest radius; -1: no photo shows the splat."""
+
+    def holds_for(self, splats: Splats, photographs: Sequence[Camera]) -> bool:
+        """Returns whether scores of these splats in these photos are the same; colours do not count."""
+        shapes = ((getattr(self.splats, name), getattr(splats, name)) for name in SHAPE)
+        same = len(photographs) == len(self.photographs) and all(torch.equal(a, b) for a, b in shapes)
+        return same and all(a.draws_as(b) for a, b in zip(self.photographs, photographs, strict=True))
+
+
+SHAPE = ("means", "scales", "quats", "log_opacities")
+"""Fields of splats that decide radii and occlusion."""
+
+
+class SplatSuRe:
+    """SplatSuRe's weights (2512.02172): low where another photo shows a surface more finely, else high.
+
+    Ours: rendered for the pseudo view instead of rendered for the photo and enlarged. Scores are kept while splats and
+    photos stay, as they do in an event.
     """
-    own, whole = (
-        unscaled_weights(drawn(one), one, photographs, number, raster) for one in (camera, photographs[number])
-    )
-    return normalised(own, float(whole.min()), float(whole.max()))
 
+    def __init__(self) -> None:
+        self.latest: Sampling | None = None
 
-def unscaled_weights(
-    splats: Splats, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
-) -> Float[Tensor, "h w"]:
-    """Renders 1 - score, plus 1 for splats that photo `number` shows most finely."""
-    score, finest = sampling_scores(splats, photographs, raster)
-    return 1 + blended((finest == number).to(score) - score, splats, camera, raster)
+    @torch.no_grad()
+    def __call__(
+        self, draw: Draw, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
+    ) -> Float[Tensor, "h w"]:
+        """Returns pixel weights of a pseudo view of photo `number`."""
+        own, whole = (
+            self.unscaled(draw(one), one, photographs, number, raster) for one in (camera, photographs[number])
+        )
+        return normalised(own, float(whole.min()), float(whole.max()))
+
+    def unscaled(
+        self, drawn: Drawn, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
+    ) -> Float[Tensor, "h w"]:
+        """Renders 1 - score, plus 1 for splats that photo `number` shows most finely."""
+        sampling = self.sampling(drawn, photographs, raster)
+        values = (sampling.finest == number).to(sampling.score) - sampling.score
+        return 1 + blended(values, drawn.splats, camera, raster)
+
+    def sampling(self, drawn: Drawn, photographs: Sequence[Camera], raster: RasterSettings) -> Sampling:
+        """Returns scores; hidden splats count as visible if each camera draws other splats (`rows`).
+
+        They would cost a render of every photo for each pseudo view.
+        """
+        latest, splats = self.latest, drawn.splats
+        if latest is None or not latest.holds_for(splats, photographs):
+            score, finest = sampling_scores(splats, photographs, raster, occlusion=drawn.rows is None)
+            copies = {name: getattr(splats, name).detach().clone() for name in SHAPE}  # training changes them in place
+            latest = Sampling(splats=replace(splats, **copies), photographs=photographs, score=score, finest=finest)
+            self.latest = latest
+        return latest
 
 
 def normalised(weights: Float[Tensor, "h w"], least: float, most: float) -> Float[Tensor, "h w"]:
@@ -56,22 +98,33 @@ def normalised(weights: Float[Tensor, "h w"], least: float, most: float) -> Floa
 
 
 def sampling_scores(
-    splats: Splats, photographs: Sequence[Camera], raster: RasterSettings
+    splats: Splats, photographs: Sequence[Camera], raster: RasterSettings, occlusion: bool = True
 ) -> tuple[Float[Tensor, "N"], Int[Tensor, "N"]]:
     """Returns (scores, number of the photo with the largest radius or -1) of splats, by their radii on the screens.
 
     A score is near 1 if one photo shows the splat more finely than another, 0 if fewer than LEAST_VIEWS show it.
+    `occlusion`: a photo shows only splats that add to its render, as published.
     """
     largest, smallest = torch.zeros_like(splats.scales[:, 0]), torch.full_like(splats.scales[:, 0], torch.inf)
     finest, views = torch.full_like(largest, -1, dtype=torch.long), torch.zeros_like(largest)
     for number, camera in enumerate(photographs):
         radii = undilated_radii(splats, camera, raster)
-        visible = radii >= 0
-        finest[radii > largest] = number
-        largest, smallest = largest.maximum(radii), torch.where(visible, smallest.minimum(radii), smallest)
+        visible = (radii >= 0) & (contributes(splats, camera, raster) if occlusion else True)
+        finest[visible & (radii > largest)] = number
+        largest = torch.where(visible, largest.maximum(radii), largest)
+        smallest = torch.where(visible, smallest.minimum(radii), smallest)
         views += visible
     score = torch.sigmoid((largest / smallest - BETTER) / SOFTNESS)
     return torch.where(views < LEAST_VIEWS, 0.0, score), finest
+
+
+def contributes(splats: Splats, camera: Camera, raster: RasterSettings) -> Bool[Tensor, "N"]:
+    """Marks splats with a blending weight in a pixel of a render."""
+    screen = rasterize(splats, camera, raster, max_weight=True).screen
+    weights = torch.zeros_like(splats.log_opacities)
+    if screen.max_weights is not None:
+        weights[screen.ids] = screen.max_weights.to(weights)
+    return weights > 0
 
 
 def blended(values: Float[Tensor, "N"], splats: Splats, camera: Camera, raster: RasterSettings) -> Float[Tensor, "h w"]:
@@ -92,13 +145,13 @@ def best_densities(points: Float[Tensor, "N 3"], cameras: Sequence[Camera]) -> F
 
 @torch.no_grad()
 def sampled_better(
-    drawn: Draw, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
+    draw: Draw, camera: Camera, photographs: Sequence[Camera], number: int, raster: RasterSettings
 ) -> Float[Tensor, "h w"]:
     """Renders weights of 1 for surfaces that the camera shows more finely than every photo, else 0 (ours).
 
     Occlusion is ignored: a photo shows all splats in its field of view. Splats in no photo have weight 1.
     """
-    splats = drawn(camera)
+    splats = draw(camera).splats
     means = splats.means.detach()
     own, best = camera.fx / camera.project(means)[1].clamp_min(camera.near), best_densities(means, photographs)
     ratio = torch.where(best > 0, own / best.clamp_min(1e-30), torch.inf)

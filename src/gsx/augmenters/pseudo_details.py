@@ -13,7 +13,7 @@ from typing import Any
 from gsx.augmenters.cameras import window_size
 from gsx.augmenters.checked_regenerator import CheckedRegenerator, Redrawing
 from gsx.augmenters.planner import Planner
-from gsx.augmenters.pseudo_options import PseudoOptions
+from gsx.augmenters.pseudo_options import WEIGHT_MAPS, PseudoOptions
 from gsx.augmenters.redraw import Redrawer
 from gsx.augmenters.store import Store
 from gsx.augmenters.timing import event_at, events_of, progress, span_of, stepped
@@ -50,7 +50,11 @@ class PseudoDetails(Redrawing):
         )
         self.store = Store(name=context.name, iterations=context.iterations, events=self.events, span=self.span)
         self.redrawer = Redrawer(
-            name=context.name, options=options, regenerator=self.regenerator, schedule=self.schedule
+            name=context.name,
+            options=options,
+            regenerator=self.regenerator,
+            schedule=self.schedule,
+            weight_map=WEIGHT_MAPS[options.weight_map](),
         )
         self.event = 0
         self.views: dict[int, list[PseudoView]] = {}

@@ -1,15 +1,21 @@
 """Options of pseudo details, checked."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated
 
 from gsx.augmenters.checks import Checks
-from gsx.augmenters.pixel_weights import WeightMap, sampled_better, splatsure
+from gsx.augmenters.pixel_weights import SplatSuRe, WeightMap, sampled_better
 from gsx.augmenters.timing import Timing, events_of
 from gsx.core.ranges import Range, Seed, Share, Steps, Weight
 from gsx.core.training.schedule import Schedule
 
-WEIGHT_MAPS: dict[str, WeightMap | None] = {"none": None, "splatsure": splatsure, "finer": sampled_better}
+WEIGHT_MAPS: dict[str, Callable[[], WeightMap | None]] = {
+    "none": lambda: None,
+    "splatsure": SplatSuRe,
+    "finer": lambda: sampled_better,
+}
+"""Makers of weight maps; None: all pixels count."""
 CHOICES = {
     "window": ("center", "random", "grid", "error"),
     "noise": ("uniform", "normal"),

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from gsx.augmenters.checked_regenerator import CheckedRegenerator
 from gsx.augmenters.consistency import consistent_pixels, exactly_consistent
-from gsx.augmenters.pixel_weights import agreeing, in_bytes
+from gsx.augmenters.pixel_weights import WeightMap, agreeing, in_bytes
 from gsx.augmenters.planner import PseudoViewSpec, reduced
-from gsx.augmenters.pseudo_options import WEIGHT_MAPS, PseudoOptions
+from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.augmenters.store import picture_name
 from gsx.augmenters.timing import ramp
 from gsx.core.data.camera import Camera
@@ -28,7 +28,7 @@ from gsx.core.data.window import Window
 from gsx.core.shapes import Float, UInt8
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.regenerator import Request
-from gsx.core.training.render import render, splats_for
+from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.schedule import Schedule
 
@@ -48,6 +48,8 @@ class Redrawer:
     options: PseudoOptions
     regenerator: CheckedRegenerator
     schedule: Schedule
+    weight_map: WeightMap | None
+    """None: all pixels count."""
 
     def redraw_all(self, run: Run, event: int, specs: Sequence[PseudoViewSpec]) -> list[PseudoView]:
         """Makes the planned pseudo views, except those with dropped pictures, and logs each batch."""
@@ -146,11 +148,11 @@ class Redrawer:
     ) -> UInt8[Tensor, "h w"] | None:
         """Returns pixel weights of a window of the result; None: all are 1."""
         options, pixel_weight = self.options, torch.ones(window.height, window.width)
-        weights = WEIGHT_MAPS[options.weight_map]
-        if weights is not None:
+        if self.weight_map is not None:
             photographs = [view.camera for view in run.train_views]
-            splats_of = partial(splats_for, run)
-            pixel_weight = pixel_weight * weights(splats_of, spec.camera, photographs, spec.parent, run.raster).cpu()
+            draw = partial(run.backbone.draw, step=run.model_step)
+            weights = self.weight_map(draw, spec.camera, photographs, spec.parent, run.raster)
+            pixel_weight = pixel_weight * weights.cpu()
         if options.gate > 0 and request.photo and spec.scale > 1:
             agreed = agreeing(result, request.image, spec.scale, request.reduction, options.gate)
             pixel_weight = pixel_weight * window.cut(agreed[None])[0]
