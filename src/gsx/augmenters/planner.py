@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 
-from gsx.augmenters.cameras import centred_window, grid_window, moved, noise, random_window, window_size, worst_window
+from gsx.augmenters.cameras import centred_window, grid_window, moved, noise, random_window, worst_window
 from gsx.augmenters.pseudo_options import PseudoOptions
 from gsx.core.data.camera import Camera
 from gsx.core.data.masks import black_out
@@ -82,7 +82,7 @@ class Planner:
         options, camera, scale = self.options, run.train_views[slot.parent].camera, slot.scale
         generator = torch.Generator().manual_seed(derived_seed(self.seed, self.name, *slot))
         zoom = scale if options.zoom == "intrinsics" else 1
-        size = window_size(camera.width, camera.height, options.narrow, zoom)
+        size = options.window_size(camera, zoom)
         pose, window = self.pose_and_window(run, slot, size, generator)
         outer = window.grown(options.context, camera.width, camera.height)
         inside = Window(

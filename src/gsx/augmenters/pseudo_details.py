@@ -10,7 +10,6 @@ from collections.abc import Set
 from dataclasses import replace
 from typing import Any
 
-from gsx.augmenters.cameras import window_size
 from gsx.augmenters.checked_regenerator import CheckedRegenerator, Redrawing
 from gsx.augmenters.planner import Planner
 from gsx.augmenters.pseudo_options import WEIGHT_MAPS, PseudoOptions
@@ -69,7 +68,7 @@ class PseudoDetails(Redrawing):
                     f"{LEAST_WINDOW} px wide or high: give smaller factors"
                 )
             for scale in options.scales:
-                width, height = size = window_size(*view.camera.size, options.narrow, scale)
+                width, height = size = options.window_size(view.camera, scale)
                 if min(size) < LEAST_WINDOW:
                     raise ConfigError(
                         f"augmenter.{name}: at scale {scale} and narrow {options.narrow:g} windows of '{view.name}' "
@@ -132,6 +131,7 @@ class PseudoDetails(Redrawing):
             observed=options.densify,
             shared=not frozen,
             squared=options.loss == "l2",
+            ssim_weight=run.training.ssim_weight if options.loss == "photometric" else 0.0,
         )
 
     def planned(self) -> tuple[int, int]:

@@ -4,9 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from gsx.augmenters.cameras import window_size
 from gsx.augmenters.checks import Checks
 from gsx.augmenters.pixel_weights import SplatSuRe, WeightMap, sampled_better
 from gsx.augmenters.timing import Timing, events_of
+from gsx.core.data.camera import Camera
 from gsx.core.ranges import Range, Seed, Share, Steps, Weight
 from gsx.core.training.schedule import Schedule
 
@@ -17,14 +19,14 @@ WEIGHT_MAPS: dict[str, Callable[[], WeightMap | None]] = {
 }
 """Makers of weight maps; None: all pixels count."""
 CHOICES = {
-    "window": ("center", "random", "grid", "error"),
+    "window": ("center", "random", "grid", "error", "whole"),
     "noise": ("uniform", "normal"),
     "kept": ("t", "center"),
     "zoom": ("intrinsics", "none"),
     "mode": ("auto", "hybrid", "direct"),
     "base_source": ("photo", "render"),
     "translation_unit": ("world", "extent"),
-    "loss": ("l1", "l2"),
+    "loss": ("l1", "l2", "photometric"),
     "reduce": ("all", "per_scale"),
     "weight_split": ("window", "run", "linear"),
     "freeze_shared": ("none", "half", "active"),
@@ -55,7 +57,8 @@ class PseudoOptions:
     narrow: Share
     """Width of the window in training as a fraction of the raster; 1: uncropped."""
     window: str
-    """center, random, grid (in turn over the events), or error (the largest mean error of the model)."""
+    """center, random, grid (in turn over the events), error (the largest mean error of the model), or whole: the whole
+    picture, `narrow` does not count."""
     zoom: str
     """intrinsics: a times the focal length; none: input at 1/a of the density and result at the training density, the
     other reading of the paper."""
@@ -80,7 +83,7 @@ class PseudoOptions:
     """Weight in direct mode, in place of lambda."""
     loss: str
     """l1: mean |difference|, as in the paper; l2: mean square, which weighs gaps between small splats more than soft
-    enlargements."""
+    enlargements; photometric: that of the photos, with SSIM."""
     gain: Weight
     """Factor of the pseudo loss before its weight."""
     per_pixel: bool
@@ -137,6 +140,10 @@ class PseudoOptions:
                 raise ValueError(f"{where}.{key} is {list(getattr(self, key))}; give two values from 0 to 1")
         if not self.base and self.variants == 0:
             raise ValueError(f"{where}.base is false and variants is 0: set one of them, or there is no pseudo view")
+
+    def window_size(self, camera: Camera, scale: int) -> tuple[int, int]:
+        """Returns (width, height) of the window of a camera's raster that is zoomed in by `scale`, px."""
+        return camera.size if self.window == "whole" else window_size(*camera.size, self.narrow, scale)
 
     def begins(self, iterations: int) -> int:
         """Returns the first event of a run of that length."""

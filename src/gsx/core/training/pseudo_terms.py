@@ -10,11 +10,10 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.window import Window
-from gsx.core.shapes import Float
 from gsx.core.training.backbone import Observation, PseudoViewListener
 from gsx.core.training.parameter_table import shared_colour
 from gsx.core.training.pseudo_views import PseudoView, Term, mask_windows, pseudo_loss
-from gsx.core.training.render import observe, render_for_training
+from gsx.core.training.render import CameraImage, observe, render_for_training
 from gsx.core.training.run import Run
 
 Divided: TypeAlias = tuple[Term, Sequence[tuple[PseudoView, float]]]
@@ -38,11 +37,11 @@ def without_windows(term: Term, camera: Camera, windows: Sequence[Window]) -> Te
     return replace(term, parts=[(mask_windows(view, camera, windows), weight) for view, weight in term.parts])
 
 
-def reusable_parts(term: Term, camera: Camera, random_background: bool) -> Divided:
-    """Separates the parts of a term whose cameras draw what the training view's does; none of unobserved terms."""
+def reusable_parts(term: Term, cameras: Sequence[Camera], random_background: bool) -> Divided:
+    """Separates the parts of a term whose cameras draw what one of `cameras` does; none of unobserved terms."""
     if random_background or not (term.shared and term.observed):
         return term, ()
-    reused = [part for part in term.parts if part[0].camera.draws_as(camera)]
+    reused = [part for part in term.parts if any(map(part[0].camera.draws_as, cameras))]
     return replace(term, parts=[part for part in term.parts if part not in reused]), reused
 
 
@@ -56,8 +55,8 @@ def backward_term(run: Run, term: Term, step: int, observations: list[Observatio
     """Runs backward for a term and returns its value; appends the observations of its renders."""
     total = 0.0
     for view, weight in term.parts:
-        drawn, rendering = render_for_training(run, view.camera, step, run.background)
-        loss = weight * pseudo_loss(rendering.image, view, term.squared)
+        drawn, rendering, _ = render_for_training(run, view.camera, step, run.background)
+        loss = weight * pseudo_loss(rendering.image, view, term.squared, term.ssim_weight)
         loss.backward()
         total += float(loss.detach())
         gradient = rendering.screen.means2d_offset.grad  # not finite in a step that will be skipped
@@ -70,8 +69,9 @@ def backward_term(run: Run, term: Term, step: int, observations: list[Observatio
     return total
 
 
-def reused_losses(image: Float[Tensor, "3 H W"], divided: Sequence[Divided]) -> Iterator[tuple[str, Tensor]]:
-    """Yields (name of the term, loss) of each pseudo view that is compared with the training view's render."""
+def reused_losses(renders: Sequence[CameraImage], divided: Sequence[Divided]) -> Iterator[tuple[str, Tensor]]:
+    """Yields (name of the term, loss) of each pseudo view that is compared with a render of the training view."""
     for term, reused in divided:
         for pseudo, weight in reused:
-            yield term.name, weight * pseudo_loss(image, pseudo, term.squared)
+            image = next(image for camera, image in renders if pseudo.camera.draws_as(camera))
+            yield term.name, weight * pseudo_loss(image, pseudo, term.squared, term.ssim_weight)

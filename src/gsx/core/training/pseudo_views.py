@@ -10,6 +10,7 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.window import Window
+from gsx.core.quality.losses import ssim_map
 from gsx.core.shapes import Float, UInt8
 
 
@@ -48,21 +49,38 @@ class Term:
     """True: gradients reach parameters that all primitives share, such as a colour network (False: de-MLP)."""
     squared: bool = False
     """Squared differences instead of the paper's absolute ones."""
+    ssim_weight: float = 0.0
+    """Weight of 1 - SSIM beside the differences, as in the photos' loss; 0 in the paper."""
     made: Sequence[PseudoView] = ()
     """Pseudo views of all training views that were made for this step."""
 
 
-def pseudo_loss(image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool = False) -> Float[Tensor, ""]:
-    """Returns the weighted mean |render - target|, plus that from `view.coarse` (SRGS); `squared`: of squares."""
+def pseudo_loss(
+    image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool = False, ssim_weight: float = 0.0
+) -> Float[Tensor, ""]:
+    """Returns the weighted mean |render - target|, plus that from `view.coarse` (SRGS).
+
+    Args:
+        image: Render by the view's camera.
+        view: Pseudo view.
+        squared: Squared differences.
+        ssim_weight: w of (1 - w) differences + w (1 - SSIM); pixel weights multiply the map of SSIM (SplatSuRe).
+    """
     size = torch.square if squared else torch.abs
-    difference = size(image - view.target.to(image.device).float() / 255)
-    if view.pixel_weight is not None:
-        difference = difference * (view.pixel_weight.to(image.device).float() / 255)
+    target = view.target.to(image.device).float() / 255
+    loss = weighted(size(image - target), view).mean()
+    if ssim_weight:
+        loss = (1 - ssim_weight) * loss + ssim_weight * weighted(1 - ssim_map(image, target), view).mean()
     if view.coarse is None:
-        return difference.mean()
+        return loss
     reduced = view.reduction.reduce(image, view.camera.width // view.coarse.shape[2])
     off = view.reduction.inner(reduced - view.coarse.to(image.device).float() / 255)
-    return difference.mean() + view.coarse_weight * size(off).mean()
+    return loss + view.coarse_weight * size(off).mean()
+
+
+def weighted(values: Float[Tensor, "C h w"], view: PseudoView) -> Float[Tensor, "C h w"]:
+    """Multiplies values by the weights of a pseudo view's pixels."""
+    return values if view.pixel_weight is None else values * (view.pixel_weight.to(values.device).float() / 255)
 
 
 def mask_windows(view: PseudoView, camera: Camera, windows: Sequence[Window]) -> PseudoView:

@@ -1,6 +1,7 @@
 """Renders of a run's model: differentiable in a training step, and in bounded memory for pictures."""
 
 from dataclasses import replace
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -13,17 +14,24 @@ from gsx.core.training.backbone import Drawn, Observation, behind_scene
 from gsx.core.training.finer_raster import finer_raster, render_scale
 from gsx.core.training.run import Run
 
+CameraImage: TypeAlias = tuple[Camera, Float[Tensor, "3 h w"]]
+"""A camera and its picture."""
 
-def render_for_training(run: Run, camera: Camera, step: int, colour: Float[Tensor, "3"]) -> tuple[Drawn, Rendering]:
-    """Renders what the backbone draws at a step over a background colour; returns both.
 
-    Screen statistics are those of the raster that was drawn; the picture is reduced from it.
+def render_for_training(
+    run: Run, camera: Camera, step: int, colour: Float[Tensor, "3"]
+) -> tuple[Drawn, Rendering, CameraImage]:
+    """Renders what the backbone draws at a step over a background colour.
+
+    Returns:
+        What was drawn, its render, and the picture before reduction with its camera. Screen statistics are those of
+        the raster that was drawn; the render's picture is reduced from it.
     """
     raster, absolute = run.views.raster_for(step)(camera), run.backbone.absolute_gradient
     drawn = run.backbone.draw(raster.drawn_for, step)
     rendering = rasterize(drawn.splats, raster.camera, run.raster, background=colour, absolute_gradient=absolute)
     image, alpha = (raster.reduced(part) for part in (rendering.image, rendering.alpha[None]))
-    return drawn, replace(rendering, image=image, alpha=alpha[0])
+    return drawn, replace(rendering, image=image, alpha=alpha[0]), (raster.camera, rendering.image)
 
 
 def observe(run: Run, drawn: Drawn, rendering: Rendering, step: int, weight: float) -> Observation:

@@ -124,16 +124,18 @@ def view_loss(run: Run, step: int, view: View, terms: Sequence[Term], colour: Fl
     """Renders a view and its pseudo views, and runs backward.
 
     Pseudo views come first, and among them those without shared parameters, whose gradients from them are dropped
-    before anything else adds to them. Pseudo views with the training view's camera reuse its render.
+    before anything else adds to them. Pseudo views with the training view's camera reuse its render, also the finer
+    one that the picture is reduced from.
     """
     windows, observations = excluded_windows(run, view, step), list[Observation]()
     counted = counted_in_loss(view, windows)
     target = black_out(run.photos.of(view), counted)
     allowed = [without_windows(term, view.camera, windows) for term in terms]
-    divided = [reusable_parts(term, view.camera, run.training.random_background) for term in allowed]
+    cameras = view.camera, run.views.raster_for(step)(view.camera).camera
+    divided = [reusable_parts(term, cameras, run.training.random_background) for term in allowed]
     parts = backward_terms(run, [term for term, _ in divided], step, observations)
     own = 1 - sum(term.replaces for term in terms)
-    drawn, rendering = render_for_training(run, view.camera, step, colour)
+    drawn, rendering, finer = render_for_training(run, view.camera, step, colour)
     backend = run.raster.backend.on(run.device.type, learning=True)
     matched = run.views.match_photo(rendering.image, target, view, learning=True)
     moments = run.photos.moments_of(view, target, backend) if counted is None else None
@@ -143,7 +145,7 @@ def view_loss(run: Run, step: int, view: View, terms: Sequence[Term], colour: Fl
         loss = loss + extra
     loss = loss if own == 1 else own * loss
     named = {"own": float(loss.detach())} | parts if parts else {}
-    for name, value in reused_losses(rendering.image, divided):
+    for name, value in reused_losses([(view.camera, rendering.image), finer], divided):
         named[name] += float(value.detach())
         loss = loss + value
     loss.backward()
