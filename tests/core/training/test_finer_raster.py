@@ -63,9 +63,11 @@ def fresh(folder: Path, *more: str) -> Run:
 def test_what_is_compared_and_looked_at_is_the_reduced_picture(tmp_path: Path) -> None:
     run = fresh(tmp_path, "training.supersampling.factor=2")
     camera = run.scene.train[0].camera
-    drawn, rendering = render_for_training(run, camera, 1, run.background)
+    drawn, rendering, finer = render_for_training(run, camera, 1, run.background)
     fine = rasterize(drawn.splats, camera.zoom(2), run.raster, background=run.background).image
     assert rendering.screen.size == (96, 72)
+    assert finer[0].draws_as(camera.zoom(2))
+    assert torch.equal(finer[1], fine)
     assert rendering.image.shape == (3, 36, 48)
     assert (rendering.image - enlarged_then_reduced(fine, 2)).abs().max() <= 1e-5
     shown = render(run, camera)

@@ -50,7 +50,7 @@ class Term:
     squared: bool = False
     """Squared differences instead of the paper's absolute ones."""
     ssim_weight: float = 0.0
-    """Weight of 1 - SSIM beside the differences, as in the photos' loss; 0 in the paper."""
+    """Weight of 1 - SSIM, as in the loss of photos; 0 in the paper."""
     made: Sequence[PseudoView] = ()
     """Pseudo views of all training views that were made for this step."""
 

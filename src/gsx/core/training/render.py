@@ -14,8 +14,8 @@ from gsx.core.training.backbone import Drawn, Observation, behind_scene
 from gsx.core.training.finer_raster import finer_raster, render_scale
 from gsx.core.training.run import Run
 
-CameraImage: TypeAlias = tuple[Camera, Float[Tensor, "3 h w"]]
-"""A camera and its picture."""
+CameraImage: TypeAlias = tuple[Camera, Tensor]
+"""A camera and its picture [3, h, w]."""
 
 
 def render_for_training(

@@ -1,0 +1,73 @@
+"""Enlarged photos as targets from the first step: one render serves both losses."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from test_pseudo_details import augmenter_of, copied_gradients, run_at
+from torch import Tensor
+
+from gsx.core.data.camera import look_at
+from gsx.core.quality.losses import photometric, ssim_map
+from gsx.core.rasterizer import rasterize
+from gsx.core.training import render as training_render
+from gsx.core.training.parameter_table import gradients, zero_grad
+from gsx.core.training.pseudo_views import PseudoView, pseudo_loss
+from gsx.core.training.trainer import backward
+
+TOGETHER = ("augmenter=super_resolved", "training.supersampling.factor=2", "training.supersampling.start=0")
+
+
+def random_picture(seed: int) -> Tensor:
+    return torch.rand(3, 20, 24, generator=torch.Generator().manual_seed(seed))
+
+
+def pseudo_view(target: Tensor, pixel_weight: Tensor | None = None) -> PseudoView:
+    camera = look_at((0, -3, 0), (0, 0, 0), fov_x=0.7, width=24, height=20)
+    return PseudoView(camera=camera, target=target, parent=0, pixel_weight=pixel_weight)
+
+
+def test_the_photos_loss_of_a_pseudo_view() -> None:
+    image, target = random_picture(0), (random_picture(1) * 255).to(torch.uint8)
+    truth = target.float() / 255
+    found = float(pseudo_loss(image, pseudo_view(target), ssim_weight=0.2))
+    assert found == pytest.approx(float(photometric(image, truth, 0.2)), rel=1e-5)
+    half = torch.zeros(20, 24, dtype=torch.uint8)
+    half[:, :12] = 255
+    by_hand = 0.8 * (image - truth).abs()[..., :12].sum() + 0.2 * (1 - ssim_map(image, truth))[..., :12].sum()
+    found = float(pseudo_loss(image, pseudo_view(target, half), ssim_weight=0.2))
+    assert found == pytest.approx(float(by_hand) / image.numel(), rel=1e-5)
+
+
+def test_one_render_serves_both_losses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """0.5 photometric(reduced render, photo) + 0.5 photometric(render, enlarged photo), with its gradients."""
+    run = run_at(tmp_path / "run", 1, *TOGETHER)
+    picked = run.sampler.count - 1
+    run.sampler.order = [picked]
+    drawn = list[tuple[int, int]]()
+
+    def counted(splats, camera, *arguments, **named):
+        drawn.append(camera.size)
+        return rasterize(splats, camera, *arguments, **named)
+
+    monkeypatch.setattr(training_render, "rasterize", counted)
+    step = backward(run)
+    found = copied_gradients(run)
+    zero_grad(run.backbone.table)
+    view = run.scene.train[picked]
+    (pseudo,) = augmenter_of(run).views[picked]
+    assert drawn == [pseudo.camera.size] == [(96, 72)]
+    splats = run.backbone.draw(view.camera, run.step + 1).splats
+    image = rasterize(splats, view.camera.zoom(2), run.raster, background=run.background).image
+    own = photometric(run.scene.reduction.unclamped(image, 2), view.image(), 0.2)
+    loss = 0.5 * own + 0.5 * photometric(image, pseudo.target.float() / 255, 0.2)
+    loss.backward()
+    assert float(step.loss) == pytest.approx(float(loss.detach()), rel=1e-5)
+    for name, gradient in gradients(run.backbone.table).items():
+        torch.testing.assert_close(found[name], gradient, rtol=1e-3, atol=1e-7, msg=name)
+
+
+def test_one_event_covers_the_run(tmp_path: Path) -> None:
+    plan = augmenter_of(run_at(tmp_path / "run", 44, *TOGETHER)).plan()
+    assert plan["events"] == [1]
+    assert plan["span"] >= 79
