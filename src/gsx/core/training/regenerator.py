@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -85,6 +85,14 @@ class NamesCode(Protocol):
 
     def named_code(self) -> str:
         """Returns the module or file that it runs; empty: none. Runs with such code resume only in trusted folders."""
+
+
+@runtime_checkable
+class HasProvenance(Protocol):
+    """A regenerator with a pretrained model."""
+
+    def provenance(self) -> dict[str, Any]:
+        """Returns what identifies the model: its name, its files and their digests."""
 
 
 @runtime_checkable

@@ -1,14 +1,15 @@
 """Evaluation on held-out views: image quality, zoomed views against true finer pixels, size and speed.
 
-Each zoomed figure is compared with the naive competitor, the x1 render enlarged by bicubic interpolation: a zoomed
-render that loses to it adds artefacts, not detail.
+Each zoomed figure is compared with two competitors: the x1 render enlarged by bicubic interpolation, and by a
+pretrained network. A zoomed render that loses to the first adds artefacts, not detail; one that loses to the second
+holds less than a network guesses.
 """
 
 import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,14 +22,16 @@ from gsx.core.shapes import Bool, Float
 from gsx.core.training.parameter_table import size_of
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.experiments.evaluation.detail import Details, details_of, explained
+from gsx.experiments.evaluation.chosen_views import evenly
+from gsx.experiments.evaluation.competitor import Competitor
+from gsx.experiments.evaluation.cross_view import CrossViews
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluated_renders import EvaluatedRenders
 from gsx.experiments.evaluation.lpips import load_lpips
 from gsx.experiments.evaluation.protocol import protocol_of
 from gsx.experiments.evaluation.remarks import NOT_MEASURED, gathered, module_remarks, module_summaries
+from gsx.experiments.evaluation.zoom_figures import ZoomFigures, measure_zoom, zoom_result
 from gsx.experiments.evaluation.zoomed import Drawing, Zoomed
-from gsx.experiments.run_folder.files import DETAIL_OF
 
 
 def peak_memory_mb(device: torch.device) -> float | None:
@@ -71,8 +74,8 @@ def silent(amount: float, part: str) -> None:
 class Evaluator:
     """Measures one run by one protocol; each view is rendered once at each zoom."""
 
-    def __init__(self, run: Run, options: EvalOptions) -> None:
-        self.run, self.options = run, options
+    def __init__(self, run: Run, options: EvalOptions, competitor: Competitor | None = None) -> None:
+        self.run, self.options, self.competitor = run, options, competitor
         self.lpips, self.renders = load_lpips(options.lpips), EvaluatedRenders(run, options)
         self.times: list[float] = []
         """Seconds of each render at the training resolution, without its way to the CPU."""
@@ -127,7 +130,7 @@ class Evaluator:
         whole, image = self.whole(view), self.renders.fit(view, self.renders.render(finer, factor).image)
         counted = finer.counted()
         enlarged, photograph = (bicubic(picture, *finer.camera.size) for picture in (whole, view.image()))
-        return Zoomed(
+        zoomed = Zoomed(
             view=finer,
             factor=factor,
             truth=black_out(finer.image(), counted),
@@ -136,17 +139,7 @@ class Evaluator:
             photograph=black_out(self.measured(photograph), counted),
             counted=self.renders.evaluated_pixels(finer, counted),
         )
-
-    def zoom_figures(self, zoomed: Zoomed) -> dict[str, float]:
-        """Measures one view at a zoom, and its competitors."""
-        truth, counted = zoomed.truth, zoomed.counted
-        return {
-            "psnr": psnr(zoomed.render, truth, counted),
-            "ssim": self.ssim(zoomed.render, truth, counted),
-            "enlarged_psnr": psnr(zoomed.enlarged, truth, counted),
-            "enlarged_ssim": self.ssim(zoomed.enlarged, truth, counted),
-            "photograph_psnr": psnr(zoomed.photograph, truth, counted),
-        }
+        return self.competitor.join(zoomed, whole, view, self.measured) if self.competitor else zoomed
 
     def work(self) -> float:
         """Returns the sum of sizes that `advance` will receive."""
@@ -169,6 +162,7 @@ class Evaluator:
         if not views:
             return {f"{factor:g}": {"unavailable": NOT_MEASURED} for factor in self.options.zoom}
         found: dict[float, list[ZoomFigures]] = {factor: [] for factor in self.options.zoom}
+        cross = CrossViews(self.run, self.options, self.renders)
         for number, (view, own) in enumerate(zip(self.run.scene.test, views, strict=True)):
             if drawing is not None:
                 drawing.whole(number, view, self.whole(view))
@@ -177,14 +171,12 @@ class Evaluator:
                     same = {kind + key: own[key] for kind in ("", "enlarged_") for key in ("psnr", "ssim")}
                     figures.append(ZoomFigures(view.group, same, {}))
                 elif zoomed := self.zoomed(view, factor):
-                    pictures = {name: getattr(zoomed, name) for name in DETAIL_OF}
-                    whole = zoomed.counted is None  # the border of a mask would be detail
-                    details = details_of(pictures, zoomed.truth, factor) if whole else {}
-                    figures.append(ZoomFigures(view.group, self.zoom_figures(zoomed), details))
+                    figures.append(measure_zoom(zoomed, self.ssim))
+                    cross.add(number, zoomed)
                     if drawing is not None:
                         drawing.zoomed(number, zoomed)
                     advance(factor**2, f"{view.name} x{factor:g}")
-        return {f"{factor:g}": zoom_result(factor, figures) for factor, figures in found.items()}
+        return {f"{factor:g}": zoom_result(factor, views) | cross.figures(factor) for factor, views in found.items()}
 
     def frames_per_second(self) -> float | None:
         """Return renders per second at the training resolution, without the first, which warms up; None: none was."""
@@ -224,38 +216,11 @@ class Evaluator:
                 [peak_memory_mb(run.device), *(line.get("memory_mb") for line in run.progress.curves)]
             ),
             "groups": {name: group_figures(vs) for name, vs in by_group.items()},
+            **({"competitor": self.competitor.provenance()} if self.competitor else {}),
             "zoom": self.zooms(views, drawing, advance),
             "views": [{key: v[key] for key in ("name", "group", *figures)} for v in views],
         }
         return evaluation | module_remarks(run, evaluation)
-
-
-class ZoomFigures(NamedTuple):
-    """Figures of one view at one zoom."""
-
-    group: str
-    figures: dict[str, float]
-    details: Details
-    """Empty: not measured."""
-
-
-def zoom_result(factor: float, views: Sequence[ZoomFigures]) -> dict[str, Any]:
-    """Returns mean figures at one zoom over all views, and over those of each group if there are groups."""
-    groups = sorted({view.group for view in views if view.group})
-    of_groups = {name: zoom_entry(factor, [view for view in views if view.group == name]) for name in groups}
-    return zoom_entry(factor, views) | ({"groups": of_groups} if groups else {})
-
-
-def zoom_entry(factor: float, views: Sequence[ZoomFigures]) -> dict[str, Any]:
-    """Returns mean figures of views at one zoom with the verdict, or the reason why there are none."""
-    if not views:
-        return {"unavailable": f"the images hold no truth at x{factor:g}: train on a larger scene.downscale"}
-    means = {key: statistics.fmean(view.figures[key] for view in views) for key in views[0].figures}
-    gain = means["psnr"] - means["enlarged_psnr"]
-    known = [view.details for view in views if view.details]
-    found = {name: explained([detail[name] for detail in known]) for name in known[0]} if known else {}
-    verdict = {"views": len(views), "beats_enlarged": None if factor == 1 else gain > 0}
-    return means | verdict | ({"detail": found} if found else {})
 
 
 def quick_psnr(run: Run, options: EvalOptions, count: int = 8) -> float:
@@ -263,9 +228,3 @@ def quick_psnr(run: Run, options: EvalOptions, count: int = 8) -> float:
     views = evenly(run.scene.test, count)
     renders = ((v, render(run, v.camera, options.tile_pixels).image) for v in views)
     return statistics.fmean(psnr(image, v.image(), v.counted()) for v, image in renders)
-
-
-def evenly(views: Sequence[View], count: int) -> list[View]:
-    """Returns up to `count` views, the middles of as many equal parts."""
-    count = min(count, len(views))
-    return [views[(2 * part + 1) * len(views) // (2 * count)] for part in range(count)]

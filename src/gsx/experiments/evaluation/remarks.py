@@ -7,6 +7,7 @@ from typing import Any
 from gsx.core.plugins import hookimpl
 from gsx.core.training.minibatch import sum_accounts
 from gsx.core.training.run import Run, StepResult
+from gsx.experiments.run_folder.files import over_upscaled, part, upscaler_of
 from gsx.modules.catalogue import MODULES
 
 logger = logging.getLogger(__name__)
@@ -91,8 +92,8 @@ def shares(counts: Mapping[str, int], requested: Mapping[str, int]) -> dict[str,
 
 def remarks_of(evaluation: Mapping[str, Any]) -> list[str]:
     """Returns remarks on an evaluation.json; none for a run without incident."""
-    kinds = (split_remarks, start_remarks, cap_remarks, pseudo_remarks, left_out_remarks, saved_remarks)
-    return [remark for kind in kinds for remark in kind(evaluation)]
+    kinds = (split_remarks, start_remarks, cap_remarks, pseudo_remarks, left_out_remarks, upscaler_remarks)
+    return [remark for kind in (*kinds, saved_remarks) for remark in kind(evaluation)]
 
 
 def split_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
@@ -136,6 +137,15 @@ def left_out_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
     count = evaluation.get("left_out") or 0
     if count:
         yield f"renders leave out {count:,.1f} splats a view, whose values cannot be drawn"
+
+
+def upscaler_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the zooms at which an upscaler of the x1 render comes closer to the truth than the zoomed render."""
+    zooms = {factor: over_upscaled(entry) for factor, entry in part(dict(evaluation), "zoom").items()}
+    lost = [f"x{factor} ({-gain:.2f} dB)" for factor, gain in zooms.items() if gain is not None and gain < 0]
+    if lost:
+        name = upscaler_of(dict(evaluation))
+        yield f"zoomed renders lose to the x1 render enlarged by {name} at {', '.join(lost)}: zoom by that instead"
 
 
 def saved_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:

@@ -1,6 +1,6 @@
 """A held-out view at a zoom with its competitors, and receivers of its pictures."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -25,6 +25,10 @@ class Zoomed:
     """The x1 render enlarged by `eval.competitor`; None: it is not measured."""
     counted: Bool[Tensor, "H W"] | None = None
     """Pixels that count, None: all; pixels outside of masks are black in every picture."""
+
+    def pictures(self, names: Iterable[str]) -> dict[str, Float[Tensor, "3 H W"]]:
+        """Returns pictures by their names here, without those that are not measured."""
+        return {name: picture for name in names if (picture := getattr(self, name)) is not None}
 
 
 @runtime_checkable

@@ -23,6 +23,7 @@ from gsx.experiments.run_folder.files import (
     RunFiles,
     detail_share,
     gain_of,
+    over_upscaled,
     part,
     read_run,
     runs_below,
@@ -35,8 +36,8 @@ DIFFERENCES = 6
 """Most configuration keys in which runs differ that an overview shows."""
 FIELDS = (
     "run", "state", "reason", "scene", "backbone", "variant", "differences", "iterations", "psnr", "ssim", "lpips",
-    "primitives", "megabytes", "seconds", "render_fps", "render_path", "peak_memory_mb", "zoom_gains", "zoom_detail",
-    "protocol", "comparable",
+    "primitives", "megabytes", "seconds", "render_fps", "render_path", "peak_memory_mb",
+    "zoom_gains", "zoom_upscaled_gains", "zoom_detail", "protocol", "comparable",
 )  # fmt: skip
 """Columns of report.csv."""
 FIGURES = ("psnr", "ssim", "lpips", "primitives", "megabytes", "render_fps", "render_path", "peak_memory_mb")
@@ -60,6 +61,7 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
         "rows": rows,
         "states": {state: n for state in STATES if (n := sum(row["state"] == state for row in rows))},
         "zooms": sorted({factor for row in rows for factor in row["gains"]}, key=float),
+        "upscaled_zooms": sorted({factor for row in rows for factor in row["upscaled_gains"]}, key=float),
         "mixed": mixed_protocols(rows),
         "groups": [compared_runs(group) | {"pictures": pictures_of(group, folder)} for group in groups],
         "baselines": baselines,
@@ -131,6 +133,7 @@ def overview_row(folder: Path, run: RunFiles) -> dict[str, Any]:
     evaluation, report = run.evaluation, run.folder / "report.html"
     zoom = {factor: entry for factor, entry in part(evaluation, "zoom").items() if factor != "1"}
     gains = {factor: gain for factor, entry in zoom.items() if (gain := gain_of(entry)) is not None}
+    rivals = {factor: gain for factor, entry in zoom.items() if (gain := over_upscaled(entry)) is not None}
     shares = {factor: share for factor, entry in zoom.items() if (share := detail_share(entry)) is not None}
     unmeasured = NOT_MEASURED if measures_nothing(evaluation) else ""
     return {
@@ -145,9 +148,11 @@ def overview_row(folder: Path, run: RunFiles) -> dict[str, Any]:
         **{key: evaluation.get(key) for key in FIGURES},
         "seconds": evaluation.get("train_seconds"),
         "gains": gains,
+        "upscaled_gains": rivals,
         "zoom_psnr": {factor: entry["psnr"] for factor, entry in zoom.items() if is_number(entry.get("psnr"))},
         "zoom_detail": by_zoom(shares),
         "zoom_gains": by_zoom(gains),
+        "zoom_upscaled_gains": by_zoom(rivals),
         "protocol": run.protocol_hash,
     }
 

@@ -34,7 +34,7 @@ WINDOW_STEP = 8
 """Grid of crops, px."""
 ERROR_FULL = 0.2
 """Mean absolute error over the channels at which an error map is brightest, in display units of [0, 1]."""
-DRAWN = re.compile(r".+\.(truth|render|error|enlarged|depth)\.(png|jpg)")
+DRAWN = re.compile(r".+\.(truth|render|error|enlarged|upscaled|depth)\.(png|jpg)")
 """Names of pictures."""
 ERROR_COLOURS = (
     (0.00, (0, 0, 4)),
@@ -91,22 +91,23 @@ class Pictures:
         return {kind: self.save(f"{name}.{kind}", reduced(image)) for kind, image in images.items()}
 
     def zoomed(self, number: int, zoomed: Zoomed) -> None:
-        """Draws the window with most detail: truth, render and the x1 render resized."""
+        """Draws the window with most detail: truth, render and the x1 render resized, also by an upscaler."""
         if number not in self.chosen:
             return
         window = most_detailed(zoomed.truth, WINDOW, zoomed.counted)
         inside = None if zoomed.counted is None else window.cut(zoomed.counted[None])[0]
         if inside is not None and not inside.any():
             return
-        images = {kind: window.cut(getattr(zoomed, kind)) for kind in ("truth", "render", "enlarged")}
+        pictures = zoomed.pictures(("truth", "render", "enlarged", "upscaled"))
+        images = {kind: window.cut(picture) for kind, picture in pictures.items()}
+        names = {"psnr": "render", "enlarged_psnr": "enlarged", "upscaled_psnr": "upscaled"}
         stem = f"{self.names[number]}.x{zoomed.factor:g}"
         self.crops.append(
             {
                 "view": zoomed.view.name,
                 "factor": zoomed.factor,
                 "window": [window.left, window.top, window.width, window.height],
-                "psnr": psnr(images["render"], images["truth"], inside),
-                "enlarged_psnr": psnr(images["enlarged"], images["truth"], inside),
+                **{key: psnr(images[kind], images["truth"], inside) for key, kind in names.items() if kind in images},
                 "files": {kind: self.save(f"{stem}.{kind}", image, True) for kind, image in images.items()},
             }
         )

@@ -17,7 +17,7 @@ from gsx import __version__
 from gsx.core.errors import InputError
 from gsx.core.files import is_file, remove_partial, replace_text
 from gsx.experiments.evaluation.remarks import NOT_MEASURED, measures_nothing, remarks_of
-from gsx.experiments.reports.charts import Mark, Series, line_chart, smoothed
+from gsx.experiments.reports.charts import Mark, Series, line_chart, smoothed, style
 from gsx.experiments.reports.overview import common_folder, runs_in, write_overview
 from gsx.experiments.reports.page import template, time_unit
 from gsx.experiments.reports.pictures import ERROR_COLOURS
@@ -27,9 +27,11 @@ from gsx.experiments.run_folder.files import (
     detail_share,
     gain_of,
     newest_checkpoint,
+    over_upscaled,
     part,
     read_run,
     state_of,
+    upscaler_of,
 )
 from gsx.experiments.run_folder.shapes import is_number
 
@@ -106,6 +108,9 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "remarks": remarks_of(evaluation),
         "unmeasured": f"{NOT_MEASURED[0].upper()}{NOT_MEASURED[1:]}." if measures_nothing(evaluation) else "",
         "zoom": zoom,
+        "upscaler": upscaler_of(evaluation),
+        "upscaled": any(row["upscaled_gain"] is not None for row in zoom),
+        "agreement": consistency_rows(zoom),
         "zoom_chart": zoom_chart(zoom),
         "growth_chart": growth_chart(run.lines),
         "curves": curves(run.lines),
@@ -145,6 +150,7 @@ def zoom_rows(evaluation: dict[str, Any]) -> list[dict[str, Any]]:
             "factor": factor,
             "entry": entry,
             "gain": None if factor == "1" else gain_of(entry),
+            "upscaled_gain": over_upscaled(entry),
             "ssim_gain": None if factor == "1" else gain_of(entry, "ssim"),
             "detail": {kind: detail_share(entry, kind) for kind in DETAIL_OF},
         }
@@ -161,6 +167,12 @@ def zoom_groups(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
+def consistency_rows(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Returns the consistency of neighbouring views at the zooms where it was measured."""
+    found = [(row["factor"], part(row["entry"], "consistency")) for row in rows]
+    return [{"factor": factor} | levels for factor, levels in found if is_number(levels.get("render"))]
+
+
 def zoom_chart(rows: Sequence[dict[str, Any]]) -> Markup:
     """Draws PSNR of zoomed and resized renders over the zoom; empty with fewer than two zooms."""
     known = [(float(row["factor"]), row["entry"]) for row in rows if is_number(row["entry"].get("psnr"))]
@@ -169,11 +181,15 @@ def zoom_chart(rows: Sequence[dict[str, Any]]) -> Markup:
     enlarged = [entry.get("enlarged_psnr") if factor != 1 else entry["psnr"] for factor, entry in known]
     if len(known) < 2 or not all(is_number(value) for value in enlarged):
         return Markup()
-    both = [
+    series = [
         Series(name="zoomed render", x=zooms, y=render, dots=True),
         Series(name="resized ×1 render", x=zooms, y=enlarged, kind="test", dots=True),
     ]
-    return line_chart(both, x_label="zoom, times the training resolution", x_ticks=zooms)
+    upscaled = {float(row["factor"]): row["entry"].get("upscaled_psnr") for row in rows}
+    if known_upscaled := {factor: value for factor, value in upscaled.items() if is_number(value)}:
+        places, values = list(known_upscaled), list(known_upscaled.values())
+        series.append(Series(name="upscaled ×1 render", x=places, y=values, kind=style(3), dots=True))
+    return line_chart(series, x_label="zoom, times the training resolution", x_ticks=zooms)
 
 
 def growth_chart(lines: Sequence[dict[str, Any]]) -> Markup:

@@ -16,7 +16,7 @@ from gsx.formats.detect import MOST_HEADER
 from gsx.formats.ply import length_of
 from gsx.formats.suffixes import suffix_of
 
-DETAIL_OF = ("render", "enlarged", "photograph")
+DETAIL_OF = ("render", "enlarged", "upscaled", "photograph")
 """Pictures of a zoom whose explained detail is measured, the model's render first."""
 SPLATS = "point_cloud.ply"
 RESULTS = ("evaluation.json", "renders/index.json", SPLATS)
@@ -259,10 +259,23 @@ def runs_below(folder: Path) -> Iterator[Path]:
 # -- figures and state -------------------------------------------------------------------------------------------------
 
 
-def gain_of(entry: dict[str, Any], figure: str = "psnr") -> float | None:
-    """Subtract the figure of the resized x1 render from that of the zoomed render; positive: closer to the truth."""
-    render, enlarged = entry.get(figure), entry.get(f"enlarged_{figure}")
-    return render - enlarged if is_number(render) and is_number(enlarged) else None
+def gain_of(entry: dict[str, Any], figure: str = "psnr", rival: str = "enlarged") -> float | None:
+    """Subtract the figure of the resized x1 render from that of the zoomed render; positive: closer to the truth.
+
+    rival: enlarged (bicubic) | upscaled (by an upscaler).
+    """
+    render, other = entry.get(figure), entry.get(f"{rival}_{figure}")
+    return render - other if is_number(render) and is_number(other) else None
+
+
+def over_upscaled(entry: dict[str, Any]) -> float | None:
+    """Return the gain in PSNR over the x1 render that an upscaler enlarged, dB."""
+    return gain_of(entry, rival="upscaled")
+
+
+def upscaler_of(evaluation: dict[str, Any]) -> str:
+    """Return the name of the upscaler that zoomed renders are compared with."""
+    return str(part(evaluation, "competitor").get("name") or "an upscaler")
 
 
 def detail_share(entry: dict[str, Any], kind: str = "render") -> float | None:

@@ -23,6 +23,8 @@ EVALUATION = ("eval", "metrics")
 """Keys that matter only after training."""
 PICTURES = (".webp", ".png")
 """Suffixes of an unbundled SOG's pictures."""
+NOT_COMPARED = "eval.competitor"
+"""Node that changes no figure of the model: two runs may differ in it."""
 UNCHANGED = {"scene.model": "auto", "scene.distances": "even"}
 """Keys newer than the first digests, with their neutral values, which do not count."""
 
@@ -151,13 +153,19 @@ def finished(run: RunFiles, config: dict[str, Any], stamp: str, idle: Collection
         run.status.get("state") == "ok"
         and not run.unfinished
         and run.evaluation.get("step") == config["iterations"]
-        and part(run.evaluation, "settings") == evaluation_settings(config)
+        and evaluated_alike(part(run.evaluation, "settings"), evaluation_settings(config))
         and composition_key(run.config, trained_on(run), idle) == composition_key(config, stamp, idle)
     )
+
+
+def evaluated_alike(saved: dict[str, Any], now: dict[str, Any]) -> bool:
+    """Return True if an evaluation was made by the settings of now; keys of `eval` that are newer do not count."""
+    known = {key: value for key, value in part(now, "eval").items() if key in part(saved, "eval")}
+    return saved == now | ({"eval": known} if known else {})
 
 
 def comparable(config: dict[str, Any]) -> dict[str, Any]:
     """Select the values to compare runs by, by dotted key: all but place and manner."""
     kept = {key: value for key, value in config.items() if key not in (*WHERE, "length")}
     start = {"init": config["init"]} | axes_of(config) if splat_file(config.get("init")) else {}
-    return flattened(without(kept | start, unchanged(config)))
+    return flattened(without(kept | start, [*unchanged(config), NOT_COMPARED]))

@@ -12,11 +12,12 @@ from gsx.core.files import write_json
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.experiments.evaluation.competitor import Competitor, competitor_for
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.remarks import measures_nothing, remarks_of
 from gsx.experiments.reports.pictures import Pictures
-from gsx.experiments.run_folder.files import DETAIL_OF, detail_share, read_run
+from gsx.experiments.run_folder.files import DETAIL_OF, detail_share, part, read_run, upscaler_of
 from gsx.experiments.run_folder.run_key import evaluation_settings
 from gsx.experiments.runs.flight import add_depth, add_flight
 from gsx.experiments.runs.progress import Countdown
@@ -28,7 +29,8 @@ logger = logging.getLogger(__name__)
 def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     """Write evaluation.json and the pictures of a run; return the evaluation."""
     options, started = settings.evaluation, time.perf_counter()
-    evaluator, pictures = Evaluator(run, options), Pictures(run.folder / "renders", run.step)
+    evaluator = Evaluator(run, options, competitor_of(run, settings))
+    pictures = Pictures(run.folder / "renders", run.step)
     if run.scene.test:
         logger.info("evaluating %d test views at zoom %s", len(run.scene.test), options.zoom)
     evaluation = evaluator.evaluate(pictures, Countdown("evaluating", evaluator.work()).advance)
@@ -48,6 +50,14 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy)]:
         logger.info("%s", line)
     return evaluation
+
+
+def competitor_of(run: Run, settings: Settings) -> Competitor | None:
+    """Return the upscaler of x1 renders for the evaluated zooms; None: there is none, or it reaches none of them."""
+    if (chosen := settings.competitor) is None:
+        return None
+    component = chosen.component
+    return competitor_for(run, component.name, lambda: component.factory(chosen.options), settings.evaluation.zoom)
 
 
 def add_depth_and_flight(run: Run, pictures: Pictures, options: EvalOptions) -> None:
@@ -84,7 +94,8 @@ def summary(evaluation: dict[str, Any]) -> list[str]:
         return [cost, *remarks_of(e)]
     lpips = "n/a (no weights)" if e["lpips"] is None else f"{e['lpips']:.4f}"
     quality = f"held-out PSNR {e['psnr']:.2f} dB, SSIM ({e['protocol']['ssim']}) {e['ssim']:.4f}, LPIPS {lpips}"
-    return [quality, cost, *(zoom_line(factor, result) for factor, result in e["zoom"].items()), *remarks_of(e)]
+    lines = [line for factor, result in e["zoom"].items() for line in zoom_lines(factor, result, upscaler_of(e))]
+    return [quality, cost, *lines, *remarks_of(e)]
 
 
 def remedies(run: Run, evaluation: dict[str, Any], remedy: str) -> list[str]:
@@ -97,20 +108,49 @@ def remedies(run: Run, evaluation: dict[str, Any], remedy: str) -> list[str]:
     return [f"for a model that is filtered for zooming in, repeat the command with {remedy}"]
 
 
-def zoom_line(factor: str, result: dict[str, Any]) -> str:
-    """Return the result at one zoom in words."""
+def zoom_lines(factor: str, result: dict[str, Any], upscaler: str) -> list[str]:
+    """Return the result at one zoom in lines."""
+    return [zoom_line(factor, result, upscaler), *consistency_lines(factor, result, upscaler)]
+
+
+def zoom_line(factor: str, result: dict[str, Any], upscaler: str = "an upscaler") -> str:
+    """Return the result at one zoom in words; `upscaler`: name of the other competitor."""
     if "unavailable" in result:
         return f"zoom x{factor}: n/a, {result['unavailable']}"
     if factor == "1":
         return f"zoom x1: {result['psnr']:.2f} dB"
     resized = "enlarged" if float(factor) > 1 else "reduced"
-    verdict = "wins against" if result["beats_enlarged"] else "loses to"
-    text = f"zoom x{factor}: {result['psnr']:.2f} dB, {verdict} the {resized} x1 render"
+    text = f"zoom x{factor}: {result['psnr']:.2f} dB, {verdict(result, 'enlarged')} the {resized} x1 render"
     text += f" ({result['enlarged_psnr']:.2f} dB)"
-    shares = [share for kind in DETAIL_OF if (share := detail_share(result, kind)) is not None]
-    if len(shares) < len(DETAIL_OF):
-        return text
-    return text + "; detail {:+.3f} (x1 {}: {:+.3f}, photo: {:+.3f})".format(shares[0], resized, *shares[1:])
+    if "upscaled_psnr" in result:
+        text += f", {verdict(result, 'upscaled')} the x1 render enlarged by {upscaler}"
+        text += f" ({result['upscaled_psnr']:.2f} dB)"
+    names = {"enlarged": f"x1 {resized}", "upscaled": f"by {upscaler}", "photograph": "photo"}
+    return text + detail_text(result, names)
+
+
+def verdict(result: dict[str, Any], rival: str) -> str:
+    """Return whether the zoomed render wins."""
+    return "wins against" if result[f"beats_{rival}"] else "loses to"
+
+
+def detail_text(result: dict[str, Any], names: dict[str, str]) -> str:
+    """Return the explained detail of a zoom's pictures; empty if it is unknown for the render."""
+    shares = {kind: share for kind in DETAIL_OF if (share := detail_share(result, kind)) is not None}
+    if "render" not in shares:
+        return ""
+    others = ", ".join(f"{names[kind]}: {share:+.3f}" for kind, share in shares.items() if kind != "render")
+    return f"; detail {shares['render']:+.3f} ({others})"
+
+
+def consistency_lines(factor: str, result: dict[str, Any], upscaler: str) -> list[str]:
+    """Return the consistency of neighbouring views at a zoom in words; none if it was not measured."""
+    levels = {kind: value for kind, value in part(result, "consistency").items() if kind != "pixels"}
+    if "render" not in levels:
+        return []
+    names = {"enlarged": "x1 enlarged", "upscaled": f"by {upscaler}", "truth": "photos"}
+    others = ", ".join(f"{names[kind]}: {level:.2f} dB" for kind, level in levels.items() if kind != "render")
+    return [f"zoom x{factor}: neighbouring views agree to {levels['render']:.2f} dB ({others})"]
 
 
 MOST_VIEWS = 6

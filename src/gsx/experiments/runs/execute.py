@@ -23,7 +23,7 @@ from gsx.experiments.runs.environment import announce
 from gsx.experiments.runs.evaluate import evaluate
 from gsx.experiments.runs.export import export
 from gsx.experiments.runs.guard import Agreement, Guard
-from gsx.experiments.runs.open import reopened
+from gsx.experiments.runs.open import refuse_code, reopened
 from gsx.experiments.runs.progress import MetricsLog, Progress
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.settings import Settings
@@ -163,6 +163,7 @@ def finish(run: Run, settings: Settings, plugins: Plugins) -> dict[str, Any]:
 def evaluate_again(folder: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> dict[str, Any]:
     """Write evaluation.json, pictures, splat file and report of a run anew; errors as `reopened`."""
     with reopened(folder, plugins, overrides) as (run, settings):
+        refuse_code(folder, settings, overrides, evaluating=True)
         if run.complete:
             return finish(run, settings, plugins)
         evaluation = evaluate(run, settings)

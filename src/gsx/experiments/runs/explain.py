@@ -15,7 +15,7 @@ from gsx.core.plugins import Plugins
 from gsx.core.ranges import Range, parts_of
 from gsx.experiments.run_folder.general_options import GeneralOptions
 from gsx.experiments.runs.compose import Compositions, Source, known_groups, listed
-from gsx.experiments.runs.settings import Settings
+from gsx.experiments.runs.settings import COMPETITOR, Settings
 from gsx.experiments.runs.typed import dotted, unknown_key
 
 KINDS = {int: "whole number", float: "number", str: "text", bool: "true or false", Path: "path"}
@@ -209,6 +209,7 @@ def schemas(settings: Settings) -> dict[str, type]:
     several |= {"regenerator": settings.regenerators}
     chosen = {"scene": settings.scene, "backbone": settings.backbone}
     chosen |= {f"{group}.{name}": one for group, nodes in several.items() for name, one in nodes.items()}
+    chosen |= {COMPETITOR: settings.competitor} if settings.competitor else {}
     found = {f"{key}.": type(options) for key, options in single.items()}
     found |= {f"{key}.": one.component.options for key, one in chosen.items()}
     return found | {"": GeneralOptions}

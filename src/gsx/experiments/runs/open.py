@@ -35,7 +35,7 @@ from gsx.experiments.runs.overrides import key_of
 from gsx.experiments.runs.progress import read_curves
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.saved_settings import read_config, value_of, write_config
-from gsx.experiments.runs.settings import Settings, named_code
+from gsx.experiments.runs.settings import COMPETITOR, Settings, named_code
 from gsx.experiments.runs.start_file import starting_splats
 from gsx.experiments.runs.tracking import build_trackers
 from gsx.experiments.runs.verified import verified
@@ -144,15 +144,20 @@ def refuse_training(folder: Path, overrides: Sequence[str]) -> None:
             raise ConfigError(f"'{word}' is for training and does not change what {folder} shows: leave it out{longer}")
 
 
-def refuse_code(folder: Path, settings: Settings, overrides: Sequence[str]) -> None:
-    """Raise InputError for a folder that names code to run, unless the command line names the same."""
+def refuse_code(folder: Path, settings: Settings, overrides: Sequence[str], evaluating: bool = False) -> None:
+    """Raise InputError for a folder that names code to run, unless the command line names the same.
+
+    evaluating: only code that an evaluation runs.
+    """
     words = [word.partition("=") for word in overrides]
     for key, code in named_code(settings).items():
+        if evaluating and key != COMPETITOR:
+            continue
         if code not in [str(value_of(value)) for name, _, value in words if name.startswith(f"{key}.")]:
-            raise InputError(
-                f"{folder / 'config.yaml'} runs code with your permissions, {key}: '{code}': check it first, then use "
-                f"`{command('resume', folder, '--trust')}`"
-            )
+            remedy = f"check it first, then use `{command('resume', folder, '--trust')}`"
+            if evaluating:
+                remedy = f"leave it out by `{command('eval', folder, f'{COMPETITOR}=null')}`, or choose it again there"
+            raise InputError(f"{folder / 'config.yaml'} runs code with your permissions, {key}: '{code}': {remedy}")
 
 
 def open_run(

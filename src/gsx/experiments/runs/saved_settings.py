@@ -18,7 +18,16 @@ from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.run_folder.files import part
 from gsx.experiments.run_folder.general_options import GeneralOptions
 from gsx.experiments.run_folder.renamed import renamed
-from gsx.experiments.runs.settings import COMPONENT_KINDS, SEVERAL, Settings, settings_from, strict_node
+from gsx.experiments.runs.compose import Compositions
+from gsx.experiments.runs.settings import (
+    COMPETITOR,
+    COMPETITOR_GROUP,
+    COMPONENT_KINDS,
+    SEVERAL,
+    Settings,
+    settings_from,
+    strict_node,
+)
 from gsx.experiments.runs.typed import dotted, schema_keys, texts, unknown_key
 
 
@@ -39,6 +48,9 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
         if not equals:
             raise ConfigError(f"'{override}' has no value: write {override}=VALUE")
         known = list(dict.fromkeys([*dotted(OmegaConf.to_container(config)), *newer_keys(config, plugins)]))
+        if key == COMPETITOR_GROUP:
+            OmegaConf.update(config, COMPETITOR, composed_competitor(override, plugins), merge=False, force_add=True)
+            continue
         if key not in known:
             raise ConfigError(unknown_key(key, known, f" for {path}", " That file lists all keys."))
         try:
@@ -46,6 +58,12 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
         except Exception as error:  # the YAML parser has its own family of errors
             raise ConfigError(f"override '{override}' cannot be read: {first_line(error)}") from error
     return settings_from(config, plugins)
+
+
+def composed_competitor(override: str, plugins: Plugins) -> dict[str, Any]:
+    """Return the upscaler that a choice of the command line names, as a new run would have it."""
+    with Compositions(plugins) as compositions:
+        return compositions.node([override], COMPETITOR)
 
 
 def saved_config(path: Path) -> DictConfig:
@@ -79,6 +97,10 @@ def newer_keys(config: DictConfig, plugins: Plugins) -> Iterator[str]:
         key: plugins.registry.find(kind, str(node.get("name", ""))).options for key, (kind, node) in nodes.items()
     }
     yield from schema_keys(GeneralOptions)
+    yield COMPETITOR
+    if isinstance(upscaler := part(values, "eval").get("competitor"), dict):
+        options = plugins.registry.find("regenerator", str(upscaler.get("name", ""))).options
+        yield from schema_keys(options, f"{COMPETITOR}.")
     for key, schema in schemas.items():
         yield from (name for name in schema_keys(schema, f"{key}.") if not name.startswith("eval.lpips"))
 

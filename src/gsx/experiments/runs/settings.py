@@ -29,6 +29,10 @@ COMPONENT_KINDS = ("scene", "backbone")
 REDRAWING = ("augmenter", "regenerator")
 SEVERAL = (*REDRAWING, "tracker")
 """Groups with several components, by name or role."""
+COMPETITOR = "eval.competitor"
+"""Key of the upscaler that zoomed renders are compared with."""
+COMPETITOR_GROUP = f"regenerator/upscale@{COMPETITOR}"
+"""Choice of that upscaler on the command line."""
 GROUPS = ("training", "eval", "metrics", "rasterizer")
 """Groups of settings without a component."""
 
@@ -94,6 +98,8 @@ class Settings:
     dataset: Dataset | None
     trackers: dict[str, Chosen]
     """Trackers by name, in the order of the command line."""
+    competitor: Chosen | None
+    """Upscaler of x1 renders that zoomed renders are compared with; None: none."""
     modules: dict[str, Chosen]
     """Modules below `training` by name, in the order of their registration."""
     resolved: dict[str, Any]
@@ -107,10 +113,14 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     raw = plain_values(OmegaConf.create(config))
     values = {key: value for key, value in raw.items() if key != "experiment"}
     nodes = {kind: named_nodes(values.pop(kind, None), kind) for kind in (*SEVERAL, "checks")}
-    several = {kind: {n: chosen(kind, node, plugins, n) for n, node in nodes[kind].items()} for kind in SEVERAL}
+    several = {
+        kind: {n: chosen(kind, node, plugins, f"{kind}.{n}") for n, node in nodes[kind].items()} for kind in SEVERAL
+    }
     single = {kind: chosen(kind, values.pop(kind, None), plugins) for kind in COMPONENT_KINDS}
     groups = {key: group_of(values.pop(key, {}), key) for key in GROUPS}
     loop, modules = training_parts(groups["training"], plugins)
+    evaluation = dict(groups["eval"])
+    competitor = competitor_from(evaluation.pop("competitor", None), plugins)
     dataset, budget = values.pop("dataset", None), values.pop("budget", None)
     if budget is not None:
         typed(Budget, budget, "budget")
@@ -121,10 +131,11 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         general=typed(GeneralOptions, values, ""),
         training=typed(TrainingOptions, loop, "training"),
         modules=modules,
-        evaluation=typed(EvalOptions, groups["eval"] | {"lpips": groups["metrics"].get("lpips", {})}, "eval"),
+        evaluation=typed(EvalOptions, evaluation | {"lpips": groups["metrics"].get("lpips", {})}, "eval"),
         raster=with_compositors(typed(RasterOptions, groups["rasterizer"], "rasterizer"), plugins),
         scene=single["scene"],
         backbone=single["backbone"],
+        competitor=competitor,
         augmenters=several["augmenter"],
         regenerators=several["regenerator"],
         dataset=typed(Dataset, dataset, "dataset") if dataset else None,
@@ -215,12 +226,21 @@ def named_nodes(values: Any, kind: str) -> dict[str, Any]:
     return {}
 
 
-def chosen(kind: str, node: Any, plugins: Plugins, inner: str = "") -> Chosen:
-    """Return the component of a node with its options; `inner`: its key in a group that holds several."""
+def competitor_from(node: Any, plugins: Plugins) -> Chosen | None:
+    """Return the upscaler of a node; None if it is null, or absent as in older runs."""
+    if node is None:
+        return None
+    if not isinstance(node, dict):
+        raise ConfigError(f"{COMPETITOR} is {node!r}: choose one with {COMPETITOR_GROUP}=NAME, or {COMPETITOR}=null")
+    return chosen("regenerator", node, plugins, COMPETITOR)
+
+
+def chosen(kind: str, node: Any, plugins: Plugins, key: str = "") -> Chosen:
+    """Return the component of a node with its options; `key`: dotted key of the node, if it is not the kind's."""
     if not isinstance(node, dict):
         raise ConfigError(f"{kind} is {node!r}, not a group of options: choose one with {kind}=NAME when training")
     component = plugins.registry.find(kind, str(node.get("name", "")))
-    return Chosen(component=component, options=typed(component.options, node, f"{kind}.{inner}" if inner else kind))
+    return Chosen(component=component, options=typed(component.options, node, key or kind))
 
 
 def group_of(value: Any, key: str) -> dict[str, Any]:
@@ -234,6 +254,7 @@ def group_of(value: Any, key: str) -> dict[str, Any]:
 def named_code(settings: Settings) -> dict[str, str]:
     """Return modules and files outside of installed packages that a composition runs, by dotted role."""
     options = {f"regenerator.{role}": one.options for role, one in settings.regenerators.items()}
+    options |= {COMPETITOR: settings.competitor.options} if settings.competitor else {}
     found = {key: one.named_code() for key, one in options.items() if isinstance(one, NamesCode)}
     return {key: code for key, code in found.items() if code}
 

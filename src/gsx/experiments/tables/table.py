@@ -15,6 +15,7 @@ from gsx.experiments.run_folder.files import (
     detail_share,
     gain_of,
     has_figures,
+    over_upscaled,
     part,
     read_run,
     state_of,
@@ -38,6 +39,7 @@ training."""
 ZOOM_MEASURES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "PSNR": lambda entry: entry.get("psnr"),
     "over enlarged": gain_of,
+    "over upscaled": over_upscaled,
     "detail": detail_share,
 }
 """By the name of `NAME xK`, from the figures at a zoom; detail: explained, above the training Nyquist frequency."""

@@ -1,0 +1,155 @@
+"""Consistency of neighbouring views: planes with a texture, whose depth and visibility are worked by hand."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsx.core.data.camera import Camera, look_at
+from gsx.experiments.evaluation.chosen_views import neighbours
+from gsx.experiments.evaluation.cross_view import Differences, SurfaceView
+from gsx.experiments.evaluation.warp import Surface, places_in, surface_of, warped
+
+SIZE = 96, 64
+NEAR_SIDE = 0.5
+"""Half of the side of a square in front of the plane."""
+
+
+def camera_at(x: float, y: float = 0.0, target: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Camera:
+    """Looks at the plane z = 0 from z = -4."""
+    return look_at([x, y, -4.0], target, up=(0, -1, 0), fov_x=0.9, width=SIZE[0], height=SIZE[1])
+
+
+def rays(camera: Camera) -> tuple[Tensor, Tensor]:
+    """Centre and directions of the pixels' rays, whose camera z is 1; world coordinates."""
+    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    slopes = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1)
+    return camera.centre.double(), slopes.double() @ camera.rotation.double()
+
+
+def texture(points: Tensor) -> Tensor:
+    """Colours of the plane, smooth at the pixels' scale."""
+    x, y = 3 * points[..., 0], 3 * points[..., 1]
+    return torch.stack([x.sin() * y.cos(), (x + y).sin(), (2 * x - y).cos()]) * 0.4 + 0.5
+
+
+def plane(camera: Camera, square_at: float | None = None) -> SurfaceView:
+    """The plane z = 0 and, at another z, a square before it; depth by intersection of rays."""
+    centre, directions = rays(camera)
+    depth = -centre[2] / directions[..., 2]
+    if square_at is not None:
+        nearer = (square_at - centre[2]) / directions[..., 2]
+        across = centre[:2] + nearer[..., None] * directions[..., :2]
+        depth = torch.where(across.abs().amax(-1) < NEAR_SIDE, nearer, depth)
+    surface = surface_of(camera, depth, torch.ones_like(depth))
+    return SurfaceView(surface=surface, pictures={"render": texture(centre + depth[..., None] * directions)})
+
+
+def noisy(view: SurfaceView, level: float, seed: int) -> SurfaceView:
+    picture = view.pictures["render"]
+    noise = level * torch.randn(picture.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return replace(view, pictures={"render": picture + noise})
+
+
+def consistency(source: SurfaceView, target: SurfaceView) -> dict[str, float]:
+    differences = Differences()
+    differences.add(source, target)
+    return differences.figures()
+
+
+def test_a_texture_of_the_world_is_consistent() -> None:
+    figures = consistency(plane(camera_at(-0.6, 0.1)), plane(camera_at(0.5, -0.2)))
+    assert figures["render"] > 40
+    assert 0.6 < figures["pixels"] < 1
+
+
+def test_a_wrong_depth_makes_it_inconsistent() -> None:
+    source, target = plane(camera_at(-0.6)), plane(camera_at(0.6))
+    wrong = replace(target, surface=replace(target.surface, depth=target.surface.depth * 1.008))
+    assert consistency(source, wrong)["render"] < 0.8 * consistency(source, target)["render"]
+
+
+def test_noise_in_the_target_alone_is_measured_as_it_is() -> None:
+    """The mean square of the noise over compared pixels."""
+    source, target = plane(camera_at(-0.3)), plane(camera_at(0.3))
+    drawn = noisy(target, 0.1, 1)
+    indices, _ = places_in(source.surface, target.surface)
+    noise = (drawn.pictures["render"] - target.pictures["render"]).flatten(1)[:, indices]
+    assert consistency(source, drawn)["render"] == pytest.approx(-10 * math.log10(noise.square().mean()), abs=0.02)
+
+
+@pytest.mark.parametrize(("shift", "share"), [(3.0, 1.0), (3.5, 2 * (0.59375**2 + 0.09375**2))])
+def test_noise_of_both_views_adds_up(shift: float, share: float) -> None:
+    """Bicubic interpolation half way between pixels keeps the sum of its squared weights of the variance."""
+    camera = replace(camera_at(0.0), rotation=torch.eye(3), translation=torch.tensor([0.0, 0.0, 4.0]))
+    moved = replace(camera, translation=torch.tensor([-shift * 4 / camera.fx, 0.0, 4.0]))
+    figures = consistency(noisy(plane(camera), 0.1, 1), noisy(plane(moved), 0.1, 2))
+    assert figures["render"] == pytest.approx(-10 * math.log10(0.01 * (1 + share)), abs=0.15)
+
+
+def test_a_view_warps_into_itself_exactly() -> None:
+    """All pixels but two along each border, which bicubic interpolation reads beyond."""
+    view = plane(camera_at(0.4, 0.3))
+    indices, places = places_in(view.surface, view.surface)
+    assert len(indices) == (SIZE[0] - 4) * (SIZE[1] - 4)
+    centres = torch.stack([indices % SIZE[0], indices // SIZE[0]]) + 0.5
+    assert torch.allclose(places, centres.double(), atol=1e-9, rtol=0)
+    picture = view.pictures["render"]
+    assert torch.allclose(warped(picture, places), picture.flatten(1)[:, indices], atol=1e-9, rtol=0)
+
+
+def test_what_one_view_hides_is_left_out() -> None:
+    """Points of the plane behind the square, from the source's centre, by intersection of their rays with it."""
+    source, target = (plane(camera_at(x), square_at=-1.0) for x in (-1.0, 1.0))
+    indices, _ = places_in(source.surface, target.surface)
+    centre, directions = rays(target.surface.camera)
+    points = (centre + target.surface.depth[..., None] * directions).flatten(0, 1)
+    seen_from = source.surface.camera.centre.double()
+    share = (-1.0 - seen_from[2]) / (points[:, 2] - seen_from[2])
+    crossing = (seen_from + share[:, None] * (points - seen_from))[:, :2].abs().amax(-1)
+    on_plane = points[:, 2].abs() < 1e-6
+    hidden = on_plane & (crossing < NEAR_SIDE)
+    compared = torch.zeros(len(points), dtype=torch.bool)
+    compared[indices] = True
+    assert hidden.sum() > 100
+    assert not (compared & hidden).any()
+    assert (compared & on_plane).sum() > 1000
+    assert (compared & ~on_plane).sum() > 100
+
+
+def test_pixels_without_cover_and_around_them_are_left_out() -> None:
+    camera = camera_at(0.0)
+    alpha = torch.ones(SIZE[1], SIZE[0])
+    alpha[30, 40] = 0.85
+    source = surface_of(camera, 4 * alpha, alpha)
+    assert not source.visible[30, 40]
+    indices, _ = places_in(source, surface_of(camera, torch.full((SIZE[1], SIZE[0]), 4.0), torch.ones_like(alpha)))
+    rows, columns = indices // SIZE[0], indices % SIZE[0]
+    assert not (((rows - 30).abs() <= 2) & ((columns - 40).abs() <= 2)).any()
+    assert len(indices) == (SIZE[0] - 4) * (SIZE[1] - 4) - 25
+
+
+def test_depth_is_a_mean_and_masked_pixels_have_none() -> None:
+    alpha, counted = torch.full((SIZE[1], SIZE[0]), 0.95), torch.ones(SIZE[1], SIZE[0], dtype=torch.bool)
+    counted[:, :10] = False
+    surface = surface_of(camera_at(0.0), 2 * alpha, alpha, counted)
+    assert torch.allclose(surface.depth[:, 10:], torch.tensor(2.0))
+    assert not surface.visible[:, :10].any()
+
+
+def test_points_behind_the_other_camera_are_left_out() -> None:
+    surface = plane(camera_at(0.0)).surface
+    beyond = replace(surface.camera, translation=surface.camera.translation - torch.tensor([0.0, 0.0, 8.0]).double())
+    behind = Surface(camera=beyond, depth=surface.depth, visible=surface.visible)
+    assert len(places_in(behind, surface)[0]) == 0
+
+
+def test_neighbours_are_the_nearest_that_look_the_same_way() -> None:
+    """At x = 0, 1, 3; the one at 0.1 looks the other way, the last is alone in its direction."""
+    cameras = [camera_at(x, target=(x, 0.0, 0.0)) for x in (0.0, 1.0, 3.0)]
+    cameras.append(camera_at(0.1, target=(0.1, 0.0, -8.0)))
+    assert neighbours(cameras, 8) == [(0, 1), (1, 0), (2, 1)]
+    assert neighbours(cameras, 1) == [(2, 1)]
+    assert neighbours(cameras, 0) == neighbours(cameras[:1], 8) == []
