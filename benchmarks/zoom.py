@@ -46,8 +46,9 @@ SUBJECTS = {
     "castle": ("scene=photos", "scene.downscale=8", "iterations=800"),
     "demo": ("scene=demo", "iterations=900"),
     "room": ("scene=room", "iterations=1500"),
+    "mixed": ("scene=demo", "scene.distances=mixed", "iterations=900"),
 }
-BUILT_IN = ("demo", "room")
+BUILT_IN = ("demo", "room", "mixed")
 USUAL = "fox,lego,desk_bottle,castle,demo"
 RULES = ("none", "magnified", "resampled")
 """Values of backbone.filter that suit a model of plain 3D-GS."""
