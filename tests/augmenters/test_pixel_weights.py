@@ -140,14 +140,20 @@ def test_the_published_weights_by_hand(distances: tuple[float, ...], published: 
     )
 
 
-@pytest.mark.parametrize(("number", "weight"), [(0, 0.0474), (1, 0.0474), (2, 1.0)])
-def test_one_opaque_splat_by_hand(number: int, weight: float) -> None:
-    """Ratio 1.25, score 0.9526: 1 - 0.9526 in photos at 5 units, 1 - 0.9526 + 1 clamped in the one at 4."""
+@pytest.mark.parametrize(("kind", "number", "weight"), [
+    ("splatsure", 0, 0.0474), ("splatsure", 1, 0.0474), ("splatsure", 2, 1.0), ("splatsure_1.7", 0, 0.9999),
+])  # fmt: skip
+def test_one_opaque_splat_by_hand(kind: str, number: int, weight: float) -> None:
+    """Ratio 1.25, score 0.9526: 1 - 0.9526 in photos at 5 units, 1 - 0.9526 + 1 clamped in the one at 4.
+
+    By the other ratio the score is sigmoid(-9) = 0.0001.
+    """
     splats = replace(dots((0.0, 0.0, 0.0), scale=0.3), log_opacities=torch.tensor([0.0]))
     photographs = [at(distance, width=2000) for distance in (5.0, 5.0, 4.0)]
     own = photographs[number].crop(999, 999, 2, 2)
-    drawn = DrawnSplats(splats=splats)
-    made = SplatSuRe().unscaled(drawn, own, photographs, number, RasterSettings(alpha_max=0.999))
+    drawn, weights = DrawnSplats(splats=splats), WEIGHT_MAPS[kind]()
+    assert isinstance(weights, SplatSuRe)
+    made = weights.unscaled(drawn, own, photographs, number, RasterSettings(alpha_max=0.999))
     assert float(made.clamp(0, 1).mean()) == pytest.approx(weight, abs=2e-3)
 
 

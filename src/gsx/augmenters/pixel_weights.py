@@ -20,7 +20,9 @@ Draw: TypeAlias = Callable[[Camera], Drawn]
 WeightMap: TypeAlias = Callable[[Draw, Camera, Sequence[Camera], int, RasterSettings], Tensor]
 """(model, camera of the pseudo view, cameras of the photos, number of its photo, rules) -> pixel weights [h, w]."""
 BETTER, SOFTNESS = 1.1, 0.05
-"""Resolution ratio above which sampling is finer, and width of the soft edge (SplatSuRe, 2512.02172)."""
+"""Resolution ratio above which sampling is finer, and width of the soft edge (SplatSuRe, 2512.02172, scripts)."""
+MUCH_BETTER = 1.7
+"""The same ratio where the scripts state none (SplatSuRe, weight_maps.py)."""
 LEAST_VIEWS = 3
 """Least photos that show a splat with a score (SplatSuRe)."""
 LEAST_PEAK = 0.9
@@ -52,10 +54,11 @@ class SplatSuRe:
     """SplatSuRe's weights (2512.02172): low where another photo shows a surface more finely, else high.
 
     Ours: rendered for the pseudo view instead of rendered for the photo and enlarged. Scores are kept while splats and
-    photos stay, as they do in an event.
+    photos stay, as they do in an event. `better`: ratio above which sampling is finer.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, better: float = BETTER) -> None:
+        self.better = better
         self.latest: Sampling | None = None
 
     @torch.no_grad()
@@ -83,7 +86,7 @@ class SplatSuRe:
         """
         latest, splats = self.latest, drawn.splats
         if latest is None or not latest.holds_for(splats, photographs):
-            score, finest = sampling_scores(splats, photographs, raster, occlusion=drawn.rows is None)
+            score, finest = sampling_scores(splats, photographs, raster, self.better, occlusion=drawn.rows is None)
             copies = {name: getattr(splats, name).detach().clone() for name in SHAPE}  # training changes them in place
             latest = Sampling(splats=replace(splats, **copies), photographs=photographs, score=score, finest=finest)
             self.latest = latest
@@ -98,7 +101,11 @@ def normalised(weights: Float[Tensor, "h w"], least: float, most: float) -> Floa
 
 
 def sampling_scores(
-    splats: Splats, photographs: Sequence[Camera], raster: RasterSettings, occlusion: bool = True
+    splats: Splats,
+    photographs: Sequence[Camera],
+    raster: RasterSettings,
+    better: float = BETTER,
+    occlusion: bool = True,
 ) -> tuple[Float[Tensor, "N"], Int[Tensor, "N"]]:
     """Returns (scores, number of the photo with the largest radius or -1) of splats, by their radii on the screens.
 
@@ -114,7 +121,7 @@ def sampling_scores(
         largest = torch.where(visible, largest.maximum(radii), largest)
         smallest = torch.where(visible, smallest.minimum(radii), smallest)
         views += visible
-    score = torch.sigmoid((largest / smallest - BETTER) / SOFTNESS)
+    score = torch.sigmoid((largest / smallest - better) / SOFTNESS)
     return torch.where(views < LEAST_VIEWS, 0.0, score), finest
 
 

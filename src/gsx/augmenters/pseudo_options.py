@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Annotated
 
 from gsx.augmenters.cameras import window_size
 from gsx.augmenters.checks import Checks
-from gsx.augmenters.pixel_weights import SplatSuRe, WeightMap, sampled_better
+from gsx.augmenters.pixel_weights import MUCH_BETTER, SplatSuRe, WeightMap, sampled_better
 from gsx.augmenters.timing import Timing, events_of
 from gsx.core.data.camera import Camera
 from gsx.core.ranges import Range, Seed, Share, Steps, Weight
@@ -15,6 +16,7 @@ from gsx.core.training.schedule import Schedule
 WEIGHT_MAPS: dict[str, Callable[[], WeightMap | None]] = {
     "none": lambda: None,
     "splatsure": SplatSuRe,
+    "splatsure_1.7": partial(SplatSuRe, MUCH_BETTER),
     "finer": lambda: sampled_better,
 }
 """Makers of weight maps; None: all pixels count."""
@@ -112,8 +114,8 @@ class PseudoOptions:
     """exact: replace results by the nearest picture that reduces to the photo in 8 bits; the log has the share of exact
     pixels (all of them for box averages)."""
     weight_map: str
-    """none; splatsure: surfaces count that no other photo shows more finely; finer (ours): those that no photo shows as
-    finely as the pseudo view."""
+    """none; splatsure: surfaces count that no other photo shows more than 1.1 times as finely; splatsure_1.7: the same
+    from 1.7 on; finer (ours): those that no photo shows as finely as the pseudo view."""
     gate: Annotated[float, Range(0, 1e6)]
     """Largest difference of a reduced block from the photo that counts, 8-bit levels; 0: all count."""
     coarse_weight: Weight
