@@ -13,6 +13,7 @@ from gsx.experiments.evaluation.chosen_views import evenly
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.lpips import LpipsOptions
+from gsx.experiments.evaluation.perceptual import NamedMetric, PerceptualMetrics
 
 
 def evaluated(folder: Path, quantise: bool = True) -> dict[str, Any]:
@@ -134,6 +135,34 @@ def test_a_view_of_which_nothing_would_be_judged_is_refused_by_name(tmp_path: Pa
         Evaluator(run, options).renders.evaluated_pixels(view, left)
     left[0, -1] = True
     assert Evaluator(run, options).renders.evaluated_pixels(view, left).sum() == 1
+
+
+class Levels:
+    """Perceptual metric of which every figure is known: the mean difference in levels of 255."""
+
+    least = 16
+
+    def distances(self, images: Sequence[Tensor], target: Tensor) -> list[float]:
+        return [255 * float((image - target).mean()) for image in images]
+
+
+def test_perceptual_figures_are_those_of_renders_and_of_their_competitor(tmp_path: Path) -> None:
+    """Levels as above; requested metrics without weights have no figure."""
+    lpips = LpipsOptions(trunk="", head="", net="vgg", input_range="unit")
+    options = EvalOptions(zoom=[1, 2, 8], quantise=True, ssim="valid", tile_pixels=1 << 20, lpips=lpips)
+    evaluator = Evaluator(run_of(tmp_path), options)
+    metrics = {"levels": NamedMetric(metric=Levels(), provenance={"metric": "levels"})}
+    evaluator.perceptual = PerceptualMetrics(["levels", "absent"], metrics)
+    found = evaluator.evaluate()
+    assert found["perceptual"] == {"levels": close(fmean((10, -20, 50))), "absent": None}
+    assert found["groups"]["near"]["perceptual"]["levels"] == close(fmean((10, -20)))
+    assert [view["perceptual"] for view in found["views"]] == [{"levels": close(level)} for level in (10, -20, 50)]
+    assert found["zoom"]["1"]["perceptual"]["levels"]["render"] == found["perceptual"]["levels"]
+    assert found["zoom"]["2"]["perceptual"] == {
+        "levels": {"render": close(fmean((6, -1))), "enlarged": close(fmean((-4, -11)))}
+    }
+    assert list(found["zoom"]["8"]) == ["unavailable"]
+    assert found["perceptual_metrics"] == {"levels": {"metric": "levels"}}
 
 
 def test_counts_and_sizes(figures: dict[str, Any]) -> None:

@@ -190,6 +190,23 @@ def test_one_quality_is_shown_at_a_time_and_the_first_without_a_script(pareto: N
     ]  # fmt: skip
 
 
+def test_perceptual_metrics_have_columns_and_fronts_towards_lower_figures(tmp_path: Path) -> None:
+    """By hand: a costs least, b is closest, c costs more than a and is further."""
+    for name, primitives, value in (("a", 10, 0.3), ("b", 30, 0.1), ("c", 20, 0.4)):
+        zoom = {"4": {"psnr": 20.0, "enlarged_psnr": 19.0, "perceptual": {"st_lpips_alex": {"render": 2 * value}}}}
+        figures = {"perceptual": {"st_lpips_alex": value}, "zoom": zoom, "primitives": primitives}
+        make_run(tmp_path / f"run_{name}", {"variant": name}, **figures)
+    page = Page(write_overview(tmp_path))
+    assert "0.3000" in page.row("run_a")
+    assert rows(tmp_path)["run_b"]["perceptual"] == "st_lpips_alex:0.1000"
+    section = page.section("garden: quality against its cost")
+    fronts = {f.all("h3")[0].text: f.all("figcaption")[0].text.replace(" , ", ", ") for f in section.all("figure")}
+    for label in ("st_lpips_alex", "st_lpips_alex ×4"):
+        assert fronts[f"{label}, lower is better, over primitives"] == "On the front: a, b"
+    assert [b.text for b in section.all("button")] == ["PSNR", "zoom ×4", "st_lpips_alex", "st_lpips_alex ×4"]
+    assert any(dot.text == "b (run_b): 0.1000, 30 primitives" for dot in section.all("circle"))
+
+
 # -- over time -----------------------------------------------------------------------------------------------------
 
 

@@ -145,7 +145,7 @@ def figures(run: Run, *, zoom: tuple[float, ...] = (1, 2, 4), psnrs: list[float]
     """The parts of evaluation.json that pictures are made from."""
     known = psnrs or [20.0 + i for i in range(len(run.scene.test))]
     views = [
-        {"name": view.name, "group": "", "psnr": value, "ssim": 0.5, "lpips": None}
+        {"name": view.name, "group": "", "psnr": value, "ssim": 0.5, "lpips": None, "perceptual": {}}
         for view, value in zip(run.scene.test, known, strict=True)
     ]
     return {"views": views, "zoom": {str(factor): {"psnr": 20.0} for factor in zoom}}

@@ -223,6 +223,23 @@ def test_both_competitors_and_neighbouring_views_are_in_the_report(tmp_path: Pat
     assert "lose to the x1 render enlarged by span at x2 (0.25 dB)" in page.text("remarks")
 
 
+def test_perceptual_figures_stand_in_cards_zooms_and_views(tmp_path: Path) -> None:
+    """The zoomed render is closer than its competitor at x2, further at x4; an entry of another shape is left out."""
+    result = evaluation(perceptual={"st_lpips_alex": 0.125, "niqe": None})
+    result["views"][1]["perceptual"] = {"st_lpips_alex": 0.4567}
+    pairs = {"2": {"render": 0.2, "enlarged": 0.3}, "4": {"render": 0.5, "enlarged": 0.4}, "8": [1]}
+    for factor, pair in pairs.items():
+        result["zoom"][factor]["perceptual"] = {"st_lpips_alex": pair}
+    page = Page(write_report(make_run(tmp_path / "run", result=result)))
+    assert "st_lpips_alex 0.1250 lower is better" in page.text("figures")
+    assert "niqe n/a no weights" in page.text("figures")
+    assert "×2 23.50 23.00 +0.50 +0.1000 0.2000 0.3000 win" in page.text("zoom")
+    assert "×4 20.00 21.50 −1.50 +0.1000 0.5000 0.4000 loss" in page.text("zoom")
+    assert 'class="n good" data-name="st_lpips_alex">0.2000' in page.source
+    assert 'class="n bad" data-name="st_lpips_alex">0.5000' in page.source
+    assert "21.25 0.9000 n/a 0.4567" in page.text("worst")
+
+
 def test_zooming_out_is_told_in_its_own_words(tmp_path: Path) -> None:
     result = evaluation(zoom={"0.25": zoom_entry(20.0, 26.0), "0.5": zoom_entry(26.5, 26.0), "2": zoom_entry(25, 24)})
     text = Page(write_report(make_run(tmp_path / "run", result=result))).text("zoom")

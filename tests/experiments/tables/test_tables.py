@@ -103,6 +103,25 @@ def test_a_failed_run_leaves_the_rest_and_no_difference_that_would_mislead(table
     assert "failed: out of memory: more" in as_text(table)
 
 
+def test_perceptual_metrics_have_columns_where_a_run_has_them(tmp_path: Path) -> None:
+    cells = [cell("base", scene, 0, tmp_path) for scene in DATASET["scenes"]]
+    for number, c in enumerate(cells):
+        write_run(c.folder, 20.0)
+        file = c.folder / "evaluation.json"
+        content = json.loads(file.read_text())
+        content["perceptual"] = {"st_lpips_alex": 0.25 + number / 4, "niqe": None}
+        content["zoom"]["2"]["perceptual"] = {"st_lpips_alex": {"render": 0.75, "enlarged": 0.5}}
+        file.write_text(json.dumps(content))
+    experiment = Experiment(
+        name="t", title="T", published="", datasets=["set"], baseline="base", seeds=[0], rows={"base": "b"}, quoted={}
+    )
+    found = table_of(experiment, {"set": DATASET}, cells, None, {}, [])
+    assert found.metrics[:5] == ["PSNR", "SSIM", "LPIPS", "s", "st_lpips_alex"]
+    assert found.at("base", DATASET["title"], "st_lpips_alex").ours == 0.375
+    assert found.at("base", DATASET["title"], "st_lpips_alex x2").ours == 0.75
+    assert "0.375" in as_text(found)
+
+
 def test_other_measures_groups_zooms_and_quoted_rows(table: Table) -> None:
     assert table.at("base", "Set & Co", "kGS").ours == 1.5  # drawn per view, in thousands
     assert table.at("base", "Scale-1", "PSNR").ours == 30.5  # of the group

@@ -1,13 +1,16 @@
 """Options of an evaluation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from gsx.core.quality.metrics import SSIM_VARIANTS
 from gsx.core.ranges import Range
 from gsx.experiments.evaluation.lpips import LpipsOptions
+from gsx.experiments.evaluation.perceptual import METRICS
 
 COLOURS, POSES = ("rendered", "fitted"), ("given", "aligned")
+LEAST_WINDOW_PIXELS = 1 << 16
+"""Four windows of 128 px, in which networks see more than borders."""
 LEAST_TILE_PIXELS = 16 * 16
 """One tile of the published rasterizer."""
 
@@ -21,6 +24,10 @@ class EvalOptions:
     ssim: str
     tile_pixels: Annotated[int, Range(LEAST_TILE_PIXELS, 1 << 31)]
     lpips: LpipsOptions
+    perceptual: list[str] = field(default_factory=list)
+    """Names of perceptual metrics, `metrics.perceptual`."""
+    perceptual_pixels: int = 0
+    """Largest picture that networks measure as a whole, `metrics.perceptual_pixels`; 0: any."""
     supersample: Annotated[int, Range(0, 16)] = 0
     """Factor by which renders are finer than each picture before they are reduced; 0: as in training."""
     colours: str = "rendered"
@@ -42,6 +49,12 @@ class EvalOptions:
             raise ValueError(f"eval.colours is '{self.colours}'; choose from {', '.join(COLOURS)}")
         if self.poses not in POSES:
             raise ValueError(f"eval.poses is '{self.poses}'; choose from {', '.join(POSES)}")
+        if unknown := [name for name in self.perceptual if name not in METRICS]:
+            raise ValueError(f"metrics.perceptual has '{unknown[0]}'; choose from {', '.join(METRICS)}")
+        if self.perceptual_pixels and self.perceptual_pixels < LEAST_WINDOW_PIXELS:
+            raise ValueError(
+                f"metrics.perceptual_pixels is {self.perceptual_pixels}; give 0, or {LEAST_WINDOW_PIXELS} and more"
+            )
         if not self.zoom:
             raise ValueError("eval.zoom is empty; give factors, for example [1,2,4]")
 

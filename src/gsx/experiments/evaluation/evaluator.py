@@ -28,6 +28,7 @@ from gsx.experiments.evaluation.cross_view import CrossViews
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluated_renders import EvaluatedRenders
 from gsx.experiments.evaluation.lpips import load_lpips
+from gsx.experiments.evaluation.perceptual import at_training_size, load_metrics
 from gsx.experiments.evaluation.protocol import protocol_of
 from gsx.experiments.evaluation.remarks import NOT_MEASURED, gathered, module_remarks, module_summaries
 from gsx.experiments.evaluation.zoom_figures import ZoomFigures, measure_zoom, zoom_result
@@ -77,6 +78,8 @@ class Evaluator:
     def __init__(self, run: Run, options: EvalOptions, competitor: Competitor | None = None) -> None:
         self.run, self.options, self.competitor = run, options, competitor
         self.lpips, self.renders = load_lpips(options.lpips), EvaluatedRenders(run, options)
+        names, ranges = options.perceptual, options.lpips.input_range
+        self.perceptual = load_metrics(names, ranges, options.perceptual_pixels, run.device)
         self.times: list[float] = []
         """Seconds of each render at the training resolution, without its way to the CPU."""
         self.kept: dict[View, Tensor] = {}
@@ -103,6 +106,7 @@ class Evaluator:
             "psnr": psnr(image, truth, evaluated),
             "ssim": self.ssim(image, truth, evaluated),
             "lpips": None if self.lpips is None else self.lpips.distance(*parts),
+            "perceptual": self.perceptual.view(*parts),
             "visible": int(tiled.visible.sum()),
             "left_out": tiled.dropped,
         }
@@ -169,9 +173,10 @@ class Evaluator:
             for factor, figures in found.items():
                 if factor == 1:  # nothing is enlarged
                     same = {kind + key: own[key] for kind in ("", "enlarged_") for key in ("psnr", "ssim")}
-                    figures.append(ZoomFigures(view.group, same, {}))
+                    figures.append(ZoomFigures(view.group, same, {}, at_training_size(own["perceptual"])))
                 elif zoomed := self.zoomed(view, factor):
-                    figures.append(measure_zoom(zoomed, self.ssim))
+                    perceptual = self.perceptual.zoomed(zoomed, self.evaluated_part)
+                    figures.append(measure_zoom(zoomed, self.ssim, perceptual))
                     cross.add(number, zoomed)
                     if drawing is not None:
                         drawing.zoomed(number, zoomed)
@@ -203,6 +208,8 @@ class Evaluator:
             "protocol": protocol_of(run, self.options, self.lpips.name if self.lpips else "n/a (no weights)"),
             "step": run.step,
             **{key: mean([v[key] for v in views]) for key in figures},
+            **self.perceptual.summary(views),
+            **self.perceptual.provenance,
             "primitives": primitives,
             "visible_primitives": mean([v["visible"] for v in views]),
             "left_out": mean([v["left_out"] for v in views]),
@@ -215,10 +222,10 @@ class Evaluator:
             "peak_memory_mb": highest(
                 [peak_memory_mb(run.device), *(line.get("memory_mb") for line in run.progress.curves)]
             ),
-            "groups": {name: group_figures(vs) for name, vs in by_group.items()},
+            "groups": {name: group_figures(vs) | self.perceptual.summary(vs) for name, vs in by_group.items()},
             **({"competitor": self.competitor.provenance()} if self.competitor else {}),
             "zoom": self.zooms(views, drawing, advance),
-            "views": [{key: v[key] for key in ("name", "group", *figures)} for v in views],
+            "views": [{key: v[key] for key in ("name", "group", *figures, "perceptual")} for v in views],
         }
         return evaluation | module_remarks(run, evaluation)
 

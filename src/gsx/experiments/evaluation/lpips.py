@@ -14,13 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from gsx.core.errors import InputError
-from gsx.core.shapes import Float
+from gsx.experiments.evaluation.feature_distance import FeatureDistance
 from gsx.experiments.evaluation.weight_files import read_weights
 
 logger = logging.getLogger(__name__)
 
-SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""LPIPS input normalisation for values in [-1, 1]."""
 Layer: TypeAlias = tuple[int, int, int, int]
 """Convolution: channels, kernel, stride, padding; a ReLU follows."""
 VGG_WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
@@ -57,38 +55,27 @@ def stages_of(net: str) -> nn.ModuleList:
     return stages
 
 
-class Lpips(nn.Module):
-    """Perceptual distance: weighted squared differences of unit-normalised features, averaged over space."""
+class Lpips(FeatureDistance):
+    """LPIPS with the features of VGG16 or AlexNet."""
 
     def __init__(self, net: str, input_range: str) -> None:
-        super().__init__()
         if net not in STAGES or input_range not in ("unit", "signed"):
             raise InputError(
                 f"metrics.lpips has net '{net}' and input_range '{input_range}': "
                 "choose net vgg or alex, input_range unit ([0,1], as published) or signed ([-1,1])"
             )
-        self.net, self.signed = net, input_range == "signed"
-        self.stages = stages_of(net)
-        self.heads = nn.ParameterList([torch.zeros(layers[-1][0]) for _, layers in STAGES[net]])
-        self.note = ""
+        super().__init__(stages_of(net), widths_of(net), input_range == "signed")
+        self.net, self.note = net, ""
 
     @property
     def name(self) -> str:
         """Returns the name of the variant in results."""
-        return f"lpips_{self.net}, input in {'[-1,1]' if self.signed else '[0,1]'}{self.note}"
+        return f"lpips_{self.net}, input in {self.input}{self.note}"
 
-    @torch.no_grad()
-    def distance(self, image: Float[Tensor, "3 H W"], target: Float[Tensor, "3 H W"]) -> float:
-        """Computes LPIPS of two pictures with values in [0, 1]."""
-        pair = torch.stack([image, target]).to(self.heads[0])
-        features = (pair * 2 - 1 if self.signed else pair) - pair.new_tensor(SHIFT)[:, None, None]
-        features = features / pair.new_tensor(SCALE)[:, None, None]
-        total = 0.0
-        for stage, head in zip(self.stages, self.heads, strict=True):
-            features = stage(features)
-            unit = features / (features.norm(dim=1, keepdim=True) + 1e-10)
-            total += float(((unit[0] - unit[1]).square() * head[:, None, None]).sum(0).mean())
-        return total
+
+def widths_of(net: str) -> list[int]:
+    """Returns the channels after each stage."""
+    return [layers[-1][0] for _, layers in STAGES[net]]
 
 
 def shapes_of(net: str) -> dict[str, dict[str, str]]:
@@ -96,7 +83,7 @@ def shapes_of(net: str) -> dict[str, dict[str, str]]:
     with torch.device("meta"):
         stages = stages_of(net)
     trunk = {f"features.{name.partition('.')[2]}": shape_text(value) for name, value in stages.state_dict().items()}
-    return {"trunk": trunk, "head": {head_name(i): str(layers[-1][0]) for i, (_, layers) in enumerate(STAGES[net])}}
+    return {"trunk": trunk, "head": {head_name(i): str(width) for i, width in enumerate(widths_of(net))}}
 
 
 def head_name(stage: int) -> str:
@@ -143,13 +130,23 @@ def load_lpips(options: LpipsOptions) -> Lpips | None:
     if not options.trunk:
         logger.info("LPIPS is not measured without weights: metrics.lpips.trunk=FILE metrics.lpips.head=FILE")
         return None
-    network = Lpips(options.net, options.input_range)
     trunk, trunk_hash = read_weights(options.trunk, "metrics.lpips.trunk")
     head, head_hash = read_weights(options.head, "metrics.lpips.head")
-    refuse_misfit(trunk, head, options.net)
+    network = lpips_from(options.net, options.input_range, trunk, head)
+    network.note = f", trunk {trunk_hash}, head {head_hash}"
+    return network
+
+
+def lpips_from(net: str, input_range: str, trunk: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Lpips:
+    """Builds the network from the tensors of two files.
+
+    Raises:
+        InputError: the options are unknown, or the files hold another network.
+    """
+    network = Lpips(net, input_range)
+    refuse_misfit(trunk, head, net)
     for stage in network.stages:
         stage.load_state_dict({name: trunk[f"features.{name}"] for name in stage.state_dict()})
     for index, parameter in enumerate(network.heads):
         parameter.data.copy_(head[head_name(index)].flatten())
-    network.note = f", trunk {trunk_hash}, head {head_hash}"
     return network.eval()

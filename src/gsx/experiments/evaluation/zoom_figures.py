@@ -9,6 +9,7 @@ from torch import Tensor
 from gsx.core.quality.metrics import psnr
 from gsx.core.shapes import Bool, Float
 from gsx.experiments.evaluation.detail import Details, details_of, explained
+from gsx.experiments.evaluation.perceptual import Figures, zoom_means
 from gsx.experiments.evaluation.zoomed import Zoomed
 from gsx.experiments.run_folder.files import DETAIL_OF
 
@@ -23,13 +24,18 @@ class ZoomFigures(NamedTuple):
     figures: dict[str, float]
     details: Details
     """Empty: not measured."""
+    perceptual: Figures
+    """Perceptual figures by metric and picture."""
 
 
-def measure_zoom(zoomed: Zoomed, ssim: Ssim) -> ZoomFigures:
-    """Measures one view at a zoom, and its competitors; no detail with a mask, whose border would be detail."""
+def measure_zoom(zoomed: Zoomed, ssim: Ssim, perceptual: Figures) -> ZoomFigures:
+    """Measures one view at a zoom, and its competitors, and adds its perceptual figures.
+
+    There is no detail with a mask, whose border would be detail.
+    """
     pictures = zoomed.pictures(DETAIL_OF)
     details = details_of(pictures, zoomed.truth, zoomed.factor) if zoomed.counted is None else {}
-    return ZoomFigures(zoomed.view.group, zoom_figures(zoomed, ssim), details)
+    return ZoomFigures(zoomed.view.group, zoom_figures(zoomed, ssim), details, perceptual)
 
 
 def zoom_figures(zoomed: Zoomed, ssim: Ssim) -> dict[str, float]:
@@ -62,7 +68,8 @@ def zoom_entry(factor: float, views: Sequence[ZoomFigures]) -> dict[str, Any]:
     known = [view.details for view in views if view.details]
     shared = [name for name in known[0] if all(name in detail for detail in known)] if known else []
     found = {name: explained([detail[name] for detail in known]) for name in shared}
-    return means | {"views": len(views)} | verdicts(factor, means) | ({"detail": found} if found else {})
+    perceptual = zoom_means([view.perceptual for view in views])
+    return means | {"views": len(views)} | verdicts(factor, means) | ({"detail": found} if found else {}) | perceptual
 
 
 def verdicts(factor: float, means: Mapping[str, float]) -> dict[str, bool | None]:

@@ -246,13 +246,16 @@ def pareto_front(costs: Sequence[float], gains: Sequence[float]) -> list[int]:
     return sorted((i for i in range(len(costs)) if not beaten(i)), key=lambda i: (costs[i], gains[i]))
 
 
-def scatter(dots: Sequence[Dot], *, x_label: str) -> Markup:
-    """Draws points, with the Pareto front (lower x, higher y) joined and named; empty without points."""
+def scatter(dots: Sequence[Dot], *, x_label: str, sign: int = 1) -> Markup:
+    """Draws points, with the Pareto front joined and named: lower x, higher y (`sign` 1) or lower y (-1).
+
+    Empty without points.
+    """
     if not dots:
         return Markup()
     log = min(dot.x for dot in dots) > 0 and max(dot.x for dot in dots) > 8 * min(dot.x for dot in dots)
     plot = Plot(axis_of((dot.x for dot in dots), log=log), axis_of(dot.y for dot in dots))
-    front = [dots[i] for i in pareto_front([dot.x for dot in dots], [dot.y for dot in dots])]
+    front = [dots[i] for i in pareto_front([dot.x for dot in dots], [sign * dot.y for dot in dots])]
     return Markup(drawing().points(plot, x_label, dots, front, labels(plot, front)))
 
 

@@ -1,7 +1,7 @@
 """Runs of one scene and protocol against each other: held-out PSNR over training time, and quality against its cost."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,6 +54,26 @@ class Group:
         return {entry.row["run"]: numbers[key] for entry, key in zip(self.entries, keys, strict=True)}
 
 
+@dataclass(frozen=True, kw_only=True)
+class Quality:
+    """A figure that is plotted against costs."""
+
+    key: str
+    label: str
+    """Name on its button."""
+    title: str
+    values: dict[str, Any]
+    """Figures by folder of the run; None: unknown."""
+    unit: str = " dB"
+    digits: int = 2
+    sign: int = 1
+    """1: higher is better; -1: lower is."""
+
+    def words(self, run: str) -> str:
+        """Formats the figure of a run."""
+        return f"{fixed(self.values[run], self.digits)}{self.unit}"
+
+
 def groups_of(entries: Sequence[Entry]) -> list[Group]:
     """Groups runs by scene and protocol; one without figures joins the first evaluated run of its scene settings."""
     members: dict[tuple[str, str], list[Entry]] = {}
@@ -78,8 +98,7 @@ def scene_settings(run: RunFiles) -> str:
 def compared_runs(group: Group) -> dict[str, Any]:
     """Returns what the page shows of a group: legend, curves and plots."""
     styles = group.styles
-    zooms = {factor for entry in group.evaluated for factor in entry.row["zoom_psnr"] if float(factor) > 1}
-    plots = [plots_of(group, factor, styles) for factor in ["1", *sorted(zooms, key=float)]]
+    plots = [plots_of(group, quality, styles) for quality in qualities_of(group)]
     return {
         "scene": group.scene,
         "protocol": group.protocol,
@@ -120,35 +139,55 @@ def curves_of(group: Group, styles: dict[str, int]) -> Markup:
     return line_chart(series, x_label=f"{unit} of training")
 
 
-def plots_of(group: Group, factor: str, styles: dict[str, int]) -> dict[str, Any]:
-    """Plots PSNR at a zoom against every cost that at least two runs have."""
-    title = "PSNR, dB" if factor == "1" else f"PSNR zoomed in ×{factor}, dB"
-    plots = [plot_of(group, factor, cost, styles) for cost in COSTS]
-    return {"key": factor, "title": title, "costs": [plot for plot in plots if plot]}
+def qualities_of(group: Group) -> Iterator[Quality]:
+    """Yields PSNR at each zoom, then the perceptual metrics at each zoom."""
+    rows = [entry.row for entry in group.evaluated]
+    zooms = sorted({factor for row in rows for factor in row["zoom_psnr"] if float(factor) > 1}, key=float)
+    yield Quality(key="1", label="PSNR", title="PSNR, dB", values={row["run"]: row["psnr"] for row in rows})
+    for factor in zooms:
+        values = {row["run"]: row["zoom_psnr"].get(factor) for row in rows}
+        title = f"PSNR zoomed in ×{factor}, dB"
+        yield Quality(key=factor, label=f"zoom ×{factor}", title=title, values=values)
+    for name in dict.fromkeys(name for row in rows for name in row["perceptual_figures"]):
+        for factor in ("1", *zooms):
+            yield perceptual_quality(rows, name, factor)
 
 
-def plot_of(group: Group, factor: str, cost: str, styles: dict[str, int]) -> dict[str, Any]:
+def perceptual_quality(rows: Sequence[dict[str, Any]], name: str, factor: str) -> Quality:
+    """Returns a perceptual metric at a zoom."""
+    label = name if factor == "1" else f"{name} ×{factor}"
+    values = {row["run"]: row["perceptual_zoomed"].get(factor, {}).get(name) for row in rows}
+    title = f"{label}, lower is better"
+    return Quality(key=f"{name}-{factor}", label=label, title=title, values=values, unit="", digits=4, sign=-1)
+
+
+def plots_of(group: Group, quality: Quality, styles: dict[str, int]) -> dict[str, Any]:
+    """Plots a figure against every cost that at least two runs have."""
+    plots = [plot_of(group, quality, cost, styles) for cost in COSTS]
+    title = {"key": quality.key, "label": quality.label, "title": quality.title}
+    return title | {"costs": [plot for plot in plots if plot]}
+
+
+def plot_of(group: Group, quality: Quality, cost: str, styles: dict[str, int]) -> dict[str, Any]:
     """Plots points with their Pareto front; empty with fewer than two."""
-    quality = {
-        e.row["run"]: e.row["psnr"] if factor == "1" else e.row["zoom_psnr"].get(factor) for e in group.evaluated
-    }
-    rows = [e.row for e in group.evaluated if is_number(e.row[cost]) and is_number(quality[e.row["run"]])]
+    values = quality.values
+    rows = [e.row for e in group.evaluated if is_number(e.row[cost]) and is_number(values[e.row["run"]])]
     if len(rows) < 2:
         return {}
     axis, _ = COSTS[cost]
     dots = [
         Dot(
             x=row[cost],
-            y=quality[row["run"]],
-            text=f"{row['name']} ({row['run']}): {fixed(quality[row['run']])} dB, {price(row, cost)}",
+            y=values[row["run"]],
+            text=f"{row['name']} ({row['run']}): {quality.words(row['run'])}, {price(row, cost)}",
             label=row["name"] if len(row["name"]) <= LABEL else row["name"][: LABEL - 1] + "…",
             colour=styles[row["run"]],
             link=row["link"],
         )
         for row in rows
     ]
-    front = pareto_front([dot.x for dot in dots], [dot.y for dot in dots])
-    return {"svg": scatter(dots, x_label=axis), "front": [rows[i] for i in front], "label": axis}
+    front = pareto_front([dot.x for dot in dots], [quality.sign * dot.y for dot in dots])
+    return {"svg": scatter(dots, x_label=axis, sign=quality.sign), "front": [rows[i] for i in front], "label": axis}
 
 
 def price(row: dict[str, Any], cost: str) -> str:

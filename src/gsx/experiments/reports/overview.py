@@ -5,7 +5,7 @@ The page refers to pictures in the runs' folders.
 
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ from gsx.experiments.run_folder.files import (
     gain_of,
     over_upscaled,
     part,
+    perceptual_figure,
+    perceptual_names,
     read_run,
     runs_below,
     state_of,
@@ -36,8 +38,8 @@ DIFFERENCES = 6
 """Most configuration keys in which runs differ that an overview shows."""
 FIELDS = (
     "run", "state", "reason", "scene", "backbone", "variant", "differences", "iterations", "psnr", "ssim", "lpips",
-    "primitives", "megabytes", "seconds", "render_fps", "render_path", "peak_memory_mb",
-    "zoom_gains", "zoom_upscaled_gains", "zoom_detail", "protocol", "comparable",
+    "perceptual", "primitives", "megabytes", "seconds", "render_fps", "render_path", "peak_memory_mb", "zoom_gains",
+    "zoom_upscaled_gains", "zoom_detail", "protocol", "comparable",
 )  # fmt: skip
 """Columns of report.csv."""
 FIGURES = ("psnr", "ssim", "lpips", "primitives", "megabytes", "render_fps", "render_path", "peak_memory_mb")
@@ -67,6 +69,7 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
         "baselines": baselines,
         "baseline_zooms": sorted({factor for entry in baselines for factor in entry["gains"]}, key=float),
         "any_lpips": any(is_number(row["lpips"]) for row in rows),
+        "perceptual": list(dict.fromkeys(name for row in rows for name in row["perceptual_figures"])),
     }
     path = folder / "report.html"
     replace_text(path, template("reports/overview.html").render(context))
@@ -135,6 +138,7 @@ def overview_row(folder: Path, run: RunFiles) -> dict[str, Any]:
     gains = {factor: gain for factor, entry in zoom.items() if (gain := gain_of(entry)) is not None}
     rivals = {factor: gain for factor, entry in zoom.items() if (gain := over_upscaled(entry)) is not None}
     shares = {factor: share for factor, entry in zoom.items() if (share := detail_share(entry)) is not None}
+    perceptual = {name: perceptual_figure(evaluation, name) for name in perceptual_names(evaluation)}
     unmeasured = NOT_MEASURED if measures_nothing(evaluation) else ""
     return {
         "run": relative(run.folder, folder),
@@ -146,6 +150,10 @@ def overview_row(folder: Path, run: RunFiles) -> dict[str, Any]:
         "variant": run.variant,
         "iterations": run.iterations,
         **{key: evaluation.get(key) for key in FIGURES},
+        "perceptual": " ".join(f"{name}:{value:.4f}" for name, value in perceptual.items()),
+        "perceptual_figures": perceptual,
+        "perceptual_zoomed": {"1": perceptual}
+        | {factor: zoom_figures(entry, perceptual) for factor, entry in zoom.items()},
         "seconds": evaluation.get("train_seconds"),
         "gains": gains,
         "upscaled_gains": rivals,
@@ -155,6 +163,11 @@ def overview_row(folder: Path, run: RunFiles) -> dict[str, Any]:
         "zoom_upscaled_gains": by_zoom(rivals),
         "protocol": run.protocol_hash,
     }
+
+
+def zoom_figures(entry: dict[str, Any], names: Iterable[str]) -> dict[str, float | None]:
+    """Returns the perceptual figures of a zoomed render by metric."""
+    return {name: perceptual_figure(entry, name) for name in names}
 
 
 def by_zoom(values: dict[str, float]) -> str:

@@ -72,7 +72,7 @@ class Pictures:
         best, worst = extremes([figure["psnr"] for figure in figures])
         roles = {worst: "worst", best: "best"} if best != worst else {}
         numbers = spread(len(figures), DRAWN_VIEWS, {best, worst})
-        keys = ("name", "group", "psnr", "ssim", "lpips")
+        keys = ("name", "group", "psnr", "ssim", "lpips", "perceptual")
         self.chosen = {i: {key: figures[i][key] for key in keys} | {"role": roles.get(i, "")} for i in numbers}
         self.names = dict(zip(numbers, file_names([figures[i]["name"] for i in numbers]), strict=True))
 

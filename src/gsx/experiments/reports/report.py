@@ -16,6 +16,7 @@ from markupsafe import Markup
 from gsx import __version__
 from gsx.core.errors import InputError
 from gsx.core.files import is_file, remove_partial, replace_text
+from gsx.experiments.evaluation.perceptual import COMPARED
 from gsx.experiments.evaluation.remarks import NOT_MEASURED, measures_nothing, remarks_of
 from gsx.experiments.reports.charts import Mark, Series, line_chart, smoothed, style
 from gsx.experiments.reports.overview import common_folder, runs_in, write_overview
@@ -29,6 +30,8 @@ from gsx.experiments.run_folder.files import (
     newest_checkpoint,
     over_upscaled,
     part,
+    perceptual_figure,
+    perceptual_names,
     read_run,
     state_of,
     upscaler_of,
@@ -112,6 +115,10 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "upscaled": any(row["upscaled_gain"] is not None for row in zoom),
         "agreement": consistency_rows(zoom),
         "zoom_chart": zoom_chart(zoom),
+        "perceptual": part(evaluation, "perceptual"),
+        "perceptual_figure": perceptual_figure,
+        "perceptual_names": perceptual_names,
+        "measured": perceptual_names(evaluation),
         "growth_chart": growth_chart(run.lines),
         "curves": curves(run.lines),
         "held_out": any("test_psnr" in line for line in run.lines),
@@ -153,6 +160,7 @@ def zoom_rows(evaluation: dict[str, Any]) -> list[dict[str, Any]]:
             "upscaled_gain": over_upscaled(entry),
             "ssim_gain": None if factor == "1" else gain_of(entry, "ssim"),
             "detail": {kind: detail_share(entry, kind) for kind in DETAIL_OF},
+            "perceptual": perceptual_pictures(entry, perceptual_names(evaluation)),
         }
         for factor, entry in sorted(part(evaluation, "zoom").items(), key=lambda item: float(item[0]))
     ]
@@ -171,6 +179,11 @@ def consistency_rows(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Returns the consistency of neighbouring views at the zooms where it was measured."""
     found = [(row["factor"], part(row["entry"], "consistency")) for row in rows]
     return [{"factor": factor} | levels for factor, levels in found if is_number(levels.get("render"))]
+
+
+def perceptual_pictures(entry: dict[str, Any], names: Sequence[str]) -> dict[str, dict[str, float | None]]:
+    """Returns the perceptual figures at a zoom by metric and picture."""
+    return {name: {kind: perceptual_figure(entry, name, kind) for kind in COMPARED} for name in names}
 
 
 def zoom_chart(rows: Sequence[dict[str, Any]]) -> Markup:

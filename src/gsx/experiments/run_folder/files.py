@@ -284,6 +284,19 @@ def detail_share(entry: dict[str, Any], kind: str = "render") -> float | None:
     return share if is_number(share) else None
 
 
+def perceptual_names(evaluation: dict[str, Any]) -> list[str]:
+    """List the perceptual metrics of which an evaluation has figures."""
+    return [name for name, value in part(evaluation, "perceptual").items() if is_number(value)]
+
+
+def perceptual_figure(entry: dict[str, Any], metric: str, picture: str = "render") -> float | None:
+    """Return a perceptual figure of an evaluation, a view or a group; of a zoom, that of one of its pictures."""
+    value = part(entry, "perceptual").get(metric)
+    if isinstance(value, dict):
+        value = value.get(picture)
+    return value if is_number(value) else None
+
+
 def state_of(run: RunFiles, reporting: bool = False) -> tuple[str, str]:
     """Return one of STATES and, unless it is `ok`, the reason; `reporting`: its report is about to be written."""
     recorded = run.status.get("state")

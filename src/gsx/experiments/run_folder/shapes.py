@@ -62,6 +62,7 @@ EVALUATION: Shape = {
     "withheld?": {"step": is_number},
     "pseudo?": {str: {"dropped": SHARES, "warned?": {str: SHARES}}},
     "left_out?": is_number_or_null,
+    "perceptual?": {str: is_number_or_null},
     "remarks?": [str],
 }
 ENVIRONMENT: Shape = {"scene?": {"notes?": list}, "history?": [{"changed?": {str: (object, object)}}]}

@@ -2,6 +2,7 @@
 
 import logging
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,18 @@ from gsx.core.training.run import Run
 from gsx.experiments.evaluation.competitor import Competitor, competitor_for
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluator import Evaluator
+from gsx.experiments.evaluation.perceptual import COMPARED
 from gsx.experiments.evaluation.remarks import measures_nothing, remarks_of
 from gsx.experiments.reports.pictures import Pictures
-from gsx.experiments.run_folder.files import DETAIL_OF, detail_share, part, read_run, upscaler_of
+from gsx.experiments.run_folder.files import (
+    DETAIL_OF,
+    detail_share,
+    part,
+    perceptual_figure,
+    perceptual_names,
+    read_run,
+    upscaler_of,
+)
 from gsx.experiments.run_folder.run_key import evaluation_settings
 from gsx.experiments.runs.flight import add_depth, add_flight
 from gsx.experiments.runs.progress import Countdown
@@ -94,6 +104,7 @@ def summary(evaluation: dict[str, Any]) -> list[str]:
         return [cost, *remarks_of(e)]
     lpips = "n/a (no weights)" if e["lpips"] is None else f"{e['lpips']:.4f}"
     quality = f"held-out PSNR {e['psnr']:.2f} dB, SSIM ({e['protocol']['ssim']}) {e['ssim']:.4f}, LPIPS {lpips}"
+    quality += "".join(f", {name} {perceptual_figure(e, name):.4f}" for name in perceptual_names(e))
     lines = [line for factor, result in e["zoom"].items() for line in zoom_lines(factor, result, upscaler_of(e))]
     return [quality, cost, *lines, *remarks_of(e)]
 
@@ -126,7 +137,7 @@ def zoom_line(factor: str, result: dict[str, Any], upscaler: str = "an upscaler"
         text += f", {verdict(result, 'upscaled')} the x1 render enlarged by {upscaler}"
         text += f" ({result['upscaled_psnr']:.2f} dB)"
     names = {"enlarged": f"x1 {resized}", "upscaled": f"by {upscaler}", "photograph": "photo"}
-    return text + detail_text(result, names)
+    return text + detail_text(result, names) + "".join(perceptual_texts(result, names))
 
 
 def verdict(result: dict[str, Any], rival: str) -> str:
@@ -141,6 +152,15 @@ def detail_text(result: dict[str, Any], names: dict[str, str]) -> str:
         return ""
     others = ", ".join(f"{names[kind]}: {share:+.3f}" for kind, share in shares.items() if kind != "render")
     return f"; detail {shares['render']:+.3f} ({others})"
+
+
+def perceptual_texts(result: dict[str, Any], names: dict[str, str]) -> Iterator[str]:
+    """Yield the perceptual figures of a zoom's pictures by metric."""
+    for metric in part(result, "perceptual"):
+        figures = {kind: value for kind in COMPARED if (value := perceptual_figure(result, metric, kind)) is not None}
+        if "render" in figures:
+            others = ", ".join(f"{names[kind]}: {value:.4f}" for kind, value in figures.items() if kind != "render")
+            yield f"; {metric} {figures['render']:.4f} ({others})"
 
 
 def consistency_lines(factor: str, result: dict[str, Any], upscaler: str) -> list[str]:

@@ -102,7 +102,8 @@ def newer_keys(config: DictConfig, plugins: Plugins) -> Iterator[str]:
         options = plugins.registry.find("regenerator", str(upscaler.get("name", ""))).options
         yield from schema_keys(options, f"{COMPETITOR}.")
     for key, schema in schemas.items():
-        yield from (name for name in schema_keys(schema, f"{key}.") if not name.startswith("eval.lpips"))
+        yield from (name for name in schema_keys(schema, f"{key}.") if not name.startswith(("eval.lpips", "eval.perc")))
+    yield from ("metrics.perceptual", "metrics.perceptual_pixels")
 
 
 def value_of(word: str) -> Any:

@@ -131,7 +131,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         general=typed(GeneralOptions, values, ""),
         training=typed(TrainingOptions, loop, "training"),
         modules=modules,
-        evaluation=typed(EvalOptions, evaluation | {"lpips": groups["metrics"].get("lpips", {})}, "eval"),
+        evaluation=typed(EvalOptions, evaluation | metric_options(groups["metrics"]), "eval"),
         raster=with_compositors(typed(RasterOptions, groups["rasterizer"], "rasterizer"), plugins),
         scene=single["scene"],
         backbone=single["backbone"],
@@ -149,6 +149,11 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
             | {f"{kind}.{n}": one.component.options for kind in REDRAWING for n, one in several[kind].items()}
         ),
     )
+
+
+def metric_options(group: dict[str, Any]) -> dict[str, Any]:
+    """Return the options of an evaluation that stand in the group `metrics`; an older run has only `lpips`."""
+    return {"lpips": {}} | {key: group[key] for key in ("lpips", "perceptual", "perceptual_pixels") if key in group}
 
 
 def plain_values(config: DictConfig) -> dict[str, Any]:

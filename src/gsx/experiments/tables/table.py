@@ -17,6 +17,8 @@ from gsx.experiments.run_folder.files import (
     has_figures,
     over_upscaled,
     part,
+    perceptual_figure,
+    perceptual_names,
     read_run,
     state_of,
 )
@@ -173,9 +175,9 @@ def table_of(
     files = {cell.folder: read_run(cell.folder) for cell in cells}
     scopes = scopes_of(datasets, experiment.scenes, published)
     zooms = sorted({z for run in files.values() for z in part(run.evaluation, "zoom") if float(z) > 1}, key=float)
-    zoomed = [f"{name} x{zoom}" for name in ZOOM_MEASURES for zoom in zooms]
+    zoomed = [f"{name} x{zoom}" for name in (*ZOOM_MEASURES, *perceptual(files)) for zoom in zooms]
     known = [name for name in zoomed if any(zoom_figure(run.evaluation, name) is not None for run in files.values())]
-    metrics = [*(published.metrics if published else ["PSNR", "SSIM", "LPIPS", "s"]), *known]
+    metrics = [*(published.metrics if published else ["PSNR", "SSIM", "LPIPS", "s"]), *perceptual(files), *known]
     figures = [
         figure(row, scope, metric, [c for c in cells if c.row == row], files, published, lacking)
         for scope in scopes
@@ -193,6 +195,11 @@ def table_of(
         saved=sum(saved_by(folder) for folder in files),
         states=counted(files, cells, lacking),
     )
+
+
+def perceptual(files: dict[Path, RunFiles]) -> list[str]:
+    """Lists the perceptual metrics of which any run has figures."""
+    return list(dict.fromkeys(name for run in files.values() for name in perceptual_names(run.evaluation)))
 
 
 def rows_of(experiment: Experiment) -> list[str]:
@@ -248,14 +255,16 @@ def measured(files: RunFiles, metric: str, group: str) -> float | None:
     if " x" in metric:
         value = None if group else zoom_figure(files.evaluation, metric)
     else:
-        value = MEASURES[metric](part(part(files.evaluation, "groups"), group) if group else files.evaluation)
+        entry = part(part(files.evaluation, "groups"), group) if group else files.evaluation
+        value = MEASURES[metric](entry) if metric in MEASURES else perceptual_figure(entry, metric)
     return value if is_number(value) else None
 
 
 def zoom_figure(evaluation: dict[str, Any], metric: str) -> float | None:
     """Returns the figure of `NAME xK`, by ZOOM_MEASURES."""
     name, _, factor = metric.partition(" x")
-    value = ZOOM_MEASURES[name](part(part(evaluation, "zoom"), factor))
+    entry = part(part(evaluation, "zoom"), factor)
+    value = ZOOM_MEASURES[name](entry) if name in ZOOM_MEASURES else perceptual_figure(entry, name)
     return value if is_number(value) else None
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from gsx.core.files import csv_text
+from gsx.experiments.evaluation.perceptual import METRICS as PERCEPTUAL
 from gsx.experiments.tables.published import METRICS
 from gsx.experiments.tables.table import Figure, Scope, Table, rows_of
 
@@ -15,7 +16,8 @@ FIELDS = (
 
 def digits(metric: str) -> int:
     """Returns the decimals of a metric, as the paper prints it."""
-    return DIGITS.get(metric.partition(" x")[0], 2)
+    name = metric.partition(" x")[0]
+    return DIGITS.get(name, 3 if name in PERCEPTUAL else 2)
 
 
 def number(value: float | None, metric: str, sign: bool = False) -> str:

@@ -1,0 +1,142 @@
+"""Perceptual figures of an evaluation: metrics by name. A metric whose weights are not installed has no figure."""
+
+import logging
+import math
+import statistics
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeAlias
+
+import torch
+from torch import Tensor
+
+from gsx.core.shapes import Float
+from gsx.experiments.evaluation.feature_distance import FeatureDistance
+from gsx.experiments.evaluation.installed_weights import InstalledWeights, MetricUnavailable, installed_weights
+from gsx.experiments.evaluation.lpips import lpips_from
+from gsx.experiments.evaluation.st_lpips import shift_tolerant_lpips
+from gsx.experiments.evaluation.windowed import WindowedDistance
+from gsx.experiments.evaluation.zoomed import Zoomed
+
+logger = logging.getLogger(__name__)
+
+Picture: TypeAlias = Float[Tensor, "3 H W"]
+Figures: TypeAlias = dict[str, dict[str, float]]
+"""By metric and by picture."""
+COMPARED = ("render", "enlarged", "upscaled")
+"""Pictures of a zoom that are compared with the truth, as far as there are any."""
+
+
+class Metric(Protocol):
+    """Perceptual metric; lower is better."""
+
+    least: int
+    """Edge of the smallest picture that is measured, px."""
+
+    def distances(self, images: Sequence[Picture], target: Picture) -> list[float]:
+        """Computes the figure of each picture."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NamedMetric:
+    """A metric and where it comes from."""
+
+    metric: Metric
+    provenance: dict[str, Any]
+
+
+NETWORKS: dict[str, Callable[[InstalledWeights, str], FeatureDistance]] = {
+    "st_lpips_alex": lambda weights, _: shift_tolerant_lpips("alex", weights.tensors["weights"]),
+    "st_lpips_vgg": lambda weights, _: shift_tolerant_lpips("vgg", weights.tensors["weights"]),
+    "lpips_alex": lambda weights, signed: lpips_from("alex", signed, **weights.tensors),
+    "lpips_vgg": lambda weights, signed: lpips_from("vgg", signed, **weights.tensors),
+}
+"""Networks by the name of the metric, from their weights and `metrics.lpips.input_range`."""
+METRICS = (*NETWORKS,)
+"""Names of `metrics.perceptual`."""
+
+
+class PerceptualMetrics:
+    """The metrics of an evaluation."""
+
+    def __init__(self, names: Sequence[str], metrics: Mapping[str, NamedMetric]) -> None:
+        self.names, self.metrics = names, metrics
+        """Requested names, and the metrics that can be measured."""
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Returns name, licence, and version and hash of the weights, of each metric that is measured."""
+        return {"perceptual_metrics": {name: one.provenance for name, one in self.metrics.items()}}
+
+    def compare(self, pictures: Mapping[str, Picture], target: Picture) -> Figures:
+        """Measures pictures against a target by each metric that pictures of that size have; finite figures only."""
+        measurable = {
+            name: one.metric for name, one in self.metrics.items() if min(target.shape[1:]) >= one.metric.least
+        }
+        found: Figures = {}
+        for name, metric in measurable.items():
+            values = zip(pictures, metric.distances(list(pictures.values()), target), strict=True)
+            found[name] = {picture: value for picture, value in values if math.isfinite(value)}
+        return found
+
+    def view(self, image: Picture, target: Picture) -> dict[str, float]:
+        """Measures a render at the training resolution by each metric."""
+        figures = self.compare({"render": image}, target)
+        return {name: values["render"] for name, values in figures.items() if values}
+
+    def zoomed(self, zoomed: Zoomed, part: Callable[[Picture], Picture]) -> Figures:
+        """Measures the pictures of a zoom by each metric; `part`: cuts what is evaluated out of a picture."""
+        compared = {name: part(picture) for name, picture in zoomed.pictures(COMPARED).items()}
+        return self.compare(compared, part(zoomed.truth)) if self.metrics else {}
+
+    def summary(self, views: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float | None]]:
+        """Returns the mean of each requested metric over views; None where it is not measured."""
+        figures = [view["perceptual"] for view in views]
+        return {"perceptual": {name: mean_of([one[name] for one in figures if name in one]) for name in self.names}}
+
+
+def mean_of(values: Sequence[float]) -> float | None:
+    """Returns the mean; None of none."""
+    return statistics.fmean(values) if values else None
+
+
+def at_training_size(view: Mapping[str, float]) -> Figures:
+    """Returns the figures of a view at the training resolution as those of a zoom, where nothing is enlarged."""
+    return {name: {"render": value, "enlarged": value} for name, value in view.items()}
+
+
+def zoom_means(views: Sequence[Figures]) -> dict[str, Figures]:
+    """Returns mean figures over views under the key `perceptual`; empty where nothing was measured."""
+    places = dict.fromkeys((metric, picture) for view in views for metric in view for picture in view[metric])
+    means: Figures = {}
+    for metric, picture in places:
+        mean = mean_of([view[metric][picture] for view in views if picture in view.get(metric, {})])
+        if mean is not None:
+            means.setdefault(metric, {})[picture] = mean
+    return {"perceptual": means} if means else {}
+
+
+def load_metrics(names: Sequence[str], input_range: str, pixels: int, device: torch.device) -> PerceptualMetrics:
+    """Loads metrics by name, with a log line for each that cannot be measured.
+
+    Args:
+        input_range: that of LPIPS, `metrics.lpips.input_range`.
+        pixels: largest picture that networks measure as a whole, 0: any.
+    """
+    return PerceptualMetrics(names, dict(loadable(names, input_range, pixels, device)))
+
+
+def loadable(
+    names: Sequence[str], input_range: str, pixels: int, device: torch.device
+) -> Iterator[tuple[str, NamedMetric]]:
+    """Yields the metrics whose weights are on this machine."""
+    for name in names:
+        try:
+            weights = installed_weights(name)
+        except MetricUnavailable as error:
+            logger.info("%s is not measured: %s", name, error)
+            continue
+        network = NETWORKS[name](weights, input_range).to(device)
+        details = {"input": network.input, "windows": f"four, of pictures above {pixels} px" if pixels else "none"}
+        yield name, NamedMetric(metric=WindowedDistance(network, pixels), provenance=weights.provenance | details)
