@@ -174,7 +174,7 @@ def test_detail_is_that_of_pictures_of_all_views() -> None:
 
     def found(*details: Details) -> dict[str, Any]:
         figures = {"psnr": 20.0, "enlarged_psnr": 19.0}
-        return zoom_entry(2, [ZoomFigures("", figures, one) for one in details])["detail"]
+        return zoom_entry(2, [ZoomFigures("", figures, one, {}) for one in details])["detail"]
 
     whole, partial = {"render": detail, "upscaled": detail}, {"render": detail}
     assert list(found(whole, whole)) == ["render", "upscaled"]

@@ -1,5 +1,6 @@
 """The figures of an evaluation, worked by hand from pictures of one grey each."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from evaluating import GROUPS, LEVELS, TRUTH, Brighter, close, decibels, run_of
+from torch import Tensor
 
 from gsx.core.errors import InputError
 from gsx.experiments.evaluation.chosen_views import evenly
