@@ -103,7 +103,7 @@ def trial_picture(view: View) -> Float[Tensor, "3 h w"]:
     image = view.image()
     height, width = (min(side, TRIAL) for side in image.shape[1:])
     top, left = (image.shape[1] - height) // 2, (image.shape[2] - width) // 2
-    return image[:, top : top + height, left : left + width].clone()
+    return image[:, top : top + height, left : left + width]
 
 
 def defect(result: Any, shape: tuple[int, int, int]) -> str:
