@@ -20,6 +20,7 @@ from gsx.experiments.evaluation.feature_distance import FeatureDistance
 from gsx.experiments.evaluation.installed_weights import MetricUnavailable, read_known
 from gsx.experiments.evaluation.perceptual import (
     METRICS,
+    MetricSettings,
     NamedMetric,
     PerceptualMetrics,
     at_training_size,
@@ -30,7 +31,7 @@ from gsx.experiments.evaluation.st_lpips import BlurredConv2d, blur, shift_toler
 from gsx.experiments.evaluation.windowed import WindowedDistance, windows_of
 from gsx.experiments.evaluation.zoomed import Zoomed
 
-CPU = torch.device("cpu")
+SETTINGS = MetricSettings(input_range="unit", pixels=0, device=torch.device("cpu"))
 PACKAGE = pytest.mark.skipif(find_spec("stlpips_pytorch") is None, reason="stlpips-pytorch is not installed")
 
 
@@ -61,7 +62,7 @@ def test_shift_tolerant_lpips_equals_its_package(
 ) -> None:
     for name in ("normal_", "kaiming_normal_", "kaiming_uniform_"):  # of 138 million weights, all read from the file
         monkeypatch.setattr(torch.nn.init, name, lambda values, *_, **__: values)
-    ours = load_metrics([f"st_lpips_{net}"], "unit", 0, CPU).metrics[f"st_lpips_{net}"]
+    ours = load_metrics([f"st_lpips_{net}"], SETTINGS).metrics[f"st_lpips_{net}"]
     theirs = package.LPIPS(net=net, variant="shift_tolerant", verbose=False)
     image, target = pictures(*size)
     with torch.no_grad():
@@ -121,7 +122,7 @@ def test_equal_pictures_have_no_distance_and_several_share_a_target() -> None:
 @PACKAGE
 def test_a_shift_by_a_pixel_is_a_small_distance() -> None:
     """Noise of the same mean square costs several times as much."""
-    metric = load_metrics(["st_lpips_alex"], "unit", 0, CPU).metrics["st_lpips_alex"].metric
+    metric = load_metrics(["st_lpips_alex"], SETTINGS).metrics["st_lpips_alex"].metric
     wide = pictures(64, 81, 1)[0]
     image, shifted = wide[..., 1:], wide[..., :-1]
     error = (image - shifted).square().mean().sqrt()
@@ -136,7 +137,7 @@ def test_weights_that_are_not_installed_leave_one_log_line(
     known = {"st_lpips_alex": {"remedy": "pip install 'gsx[perceptual]'", "files": {"weights": absent()}}}
     monkeypatch.setattr(installed_weights, "known_weights", lambda: known)
     with caplog.at_level(logging.INFO):
-        metrics = load_metrics(["st_lpips_alex"], "unit", 0, CPU)
+        metrics = load_metrics(["st_lpips_alex"], SETTINGS)
     assert not metrics.metrics
     assert caplog.messages == [
         "st_lpips_alex is not measured: gsx-absent-package is not installed: pip install 'gsx[perceptual]'"

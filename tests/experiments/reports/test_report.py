@@ -232,7 +232,7 @@ def test_perceptual_figures_stand_in_cards_zooms_and_views(tmp_path: Path) -> No
         result["zoom"][factor]["perceptual"] = {"st_lpips_alex": pair}
     page = Page(write_report(make_run(tmp_path / "run", result=result)))
     assert "st_lpips_alex 0.1250 lower is better" in page.text("figures")
-    assert "niqe n/a no weights" in page.text("figures")
+    assert "niqe n/a not measured" in page.text("figures")
     assert "×2 23.50 23.00 +0.50 +0.1000 0.2000 0.3000 win" in page.text("zoom")
     assert "×4 20.00 21.50 −1.50 +0.1000 0.5000 0.4000 loss" in page.text("zoom")
     assert 'class="n good" data-name="st_lpips_alex">0.2000' in page.source

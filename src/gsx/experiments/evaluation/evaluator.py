@@ -28,7 +28,7 @@ from gsx.experiments.evaluation.cross_view import CrossViews
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluated_renders import EvaluatedRenders
 from gsx.experiments.evaluation.lpips import load_lpips
-from gsx.experiments.evaluation.perceptual import at_training_size, load_metrics
+from gsx.experiments.evaluation.perceptual import MetricSettings, at_training_size, load_metrics
 from gsx.experiments.evaluation.protocol import protocol_of
 from gsx.experiments.evaluation.remarks import NOT_MEASURED, gathered, module_remarks, module_summaries
 from gsx.experiments.evaluation.zoom_figures import ZoomFigures, measure_zoom, zoom_result
@@ -64,6 +64,12 @@ def group_figures(views: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     return {name: mean([view[key] for view in views]) for name, key in keys.items()}
 
 
+def metric_settings(run: Run, options: EvalOptions) -> MetricSettings:
+    """Returns what the perceptual metrics of a run need."""
+    pixels, ranges = options.perceptual_pixels, options.lpips.input_range
+    return MetricSettings(input_range=ranges, pixels=pixels, device=run.device, photos=run.scene.train)
+
+
 Advance = Callable[[float, str], None]
 """Callback after each picture: its size in units of an x1 picture, and its name."""
 
@@ -78,8 +84,7 @@ class Evaluator:
     def __init__(self, run: Run, options: EvalOptions, competitor: Competitor | None = None) -> None:
         self.run, self.options, self.competitor = run, options, competitor
         self.lpips, self.renders = load_lpips(options.lpips), EvaluatedRenders(run, options)
-        names, ranges = options.perceptual, options.lpips.input_range
-        self.perceptual = load_metrics(names, ranges, options.perceptual_pixels, run.device)
+        self.perceptual = load_metrics(options.perceptual, metric_settings(run, options))
         self.times: list[float] = []
         """Seconds of each render at the training resolution, without its way to the CPU."""
         self.kept: dict[View, Tensor] = {}

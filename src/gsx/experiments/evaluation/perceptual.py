@@ -10,10 +10,14 @@ from typing import Any, Protocol, TypeAlias
 import torch
 from torch import Tensor
 
+from gsx.core.data.masks import black_out
+from gsx.core.data.scene import View
 from gsx.core.shapes import Float
+from gsx.experiments.evaluation.chosen_views import evenly
 from gsx.experiments.evaluation.feature_distance import FeatureDistance
 from gsx.experiments.evaluation.installed_weights import InstalledWeights, MetricUnavailable, installed_weights
 from gsx.experiments.evaluation.lpips import lpips_from
+from gsx.experiments.evaluation.niqe import niqe_of
 from gsx.experiments.evaluation.st_lpips import shift_tolerant_lpips
 from gsx.experiments.evaluation.windowed import WindowedDistance
 from gsx.experiments.evaluation.zoomed import Zoomed
@@ -53,8 +57,11 @@ NETWORKS: dict[str, Callable[[InstalledWeights, str], FeatureDistance]] = {
     "lpips_vgg": lambda weights, signed: lpips_from("vgg", signed, **weights.tensors),
 }
 """Networks by the name of the metric, from their weights and `metrics.lpips.input_range`."""
-METRICS = (*NETWORKS,)
+METRICS = (*NETWORKS, "niqe")
 """Names of `metrics.perceptual`."""
+NIQE = "NIQE (Mittal et al. 2013), statistics of the scene's training photos"
+NIQE_PHOTOS = 100
+"""Most training photos whose patches make NIQE's statistics."""
 
 
 class PerceptualMetrics:
@@ -117,26 +124,44 @@ def zoom_means(views: Sequence[Figures]) -> dict[str, Figures]:
     return {"perceptual": means} if means else {}
 
 
-def load_metrics(names: Sequence[str], input_range: str, pixels: int, device: torch.device) -> PerceptualMetrics:
-    """Loads metrics by name, with a log line for each that cannot be measured.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MetricSettings:
+    """Inputs of metrics besides their weights."""
 
-    Args:
-        input_range: that of LPIPS, `metrics.lpips.input_range`.
-        pixels: largest picture that networks measure as a whole, 0: any.
-    """
-    return PerceptualMetrics(names, dict(loadable(names, input_range, pixels, device)))
+    input_range: str
+    """Range of values that LPIPS gets, `metrics.lpips.input_range`."""
+    pixels: int
+    """Largest picture that networks measure as a whole, 0: any."""
+    device: torch.device
+    photos: Sequence[View] = ()
+    """Training views, whose photos NIQE takes for natural."""
 
 
-def loadable(
-    names: Sequence[str], input_range: str, pixels: int, device: torch.device
-) -> Iterator[tuple[str, NamedMetric]]:
-    """Yields the metrics whose weights are on this machine."""
+def load_metrics(names: Sequence[str], settings: MetricSettings) -> PerceptualMetrics:
+    """Loads metrics by name, with a log line for each that cannot be measured."""
+    return PerceptualMetrics(names, dict(loadable(names, settings)))
+
+
+def loadable(names: Sequence[str], settings: MetricSettings) -> Iterator[tuple[str, NamedMetric]]:
+    """Yields the metrics that can be measured on this machine."""
     for name in names:
         try:
-            weights = installed_weights(name)
+            yield name, network_metric(name, settings) if name in NETWORKS else niqe_metric(settings.photos)
         except MetricUnavailable as error:
             logger.info("%s is not measured: %s", name, error)
-            continue
-        network = NETWORKS[name](weights, input_range).to(device)
-        details = {"input": network.input, "windows": f"four, of pictures above {pixels} px" if pixels else "none"}
-        yield name, NamedMetric(metric=WindowedDistance(network, pixels), provenance=weights.provenance | details)
+
+
+def network_metric(name: str, settings: MetricSettings) -> NamedMetric:
+    """Loads a network with its weights."""
+    weights, pixels = installed_weights(name), settings.pixels
+    network = NETWORKS[name](weights, settings.input_range).to(settings.device)
+    details = {"input": network.input, "windows": f"four, of pictures above {pixels} px" if pixels else "none"}
+    return NamedMetric(metric=WindowedDistance(network, pixels), provenance=weights.provenance | details)
+
+
+def niqe_metric(views: Sequence[View]) -> NamedMetric:
+    """Builds NIQE from the photos of up to NIQE_PHOTOS training views."""
+    chosen = evenly(views, NIQE_PHOTOS)
+    metric, patches = niqe_of(black_out(view.image(), view.counted()) for view in chosen)
+    source = f"{patches} sharp patches of {len(chosen)} training photos of this scene"
+    return NamedMetric(metric=metric, provenance={"metric": NIQE, "statistics": source})
