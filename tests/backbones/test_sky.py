@@ -20,9 +20,9 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.training.importance import Probe
 from gsx.core.training.parameter_table import append_rows, detached_rows, keep_rows
 from gsx.core.training.render import render, splats_for
+from gsx.experiments.evaluation.evaluated_renders import depth_and_coverage
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
-from gsx.experiments.runs.flight import depth_and_coverage
 from gsx.experiments.runs.open import open_run
 
 FAR = 200.0

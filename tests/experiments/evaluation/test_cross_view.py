@@ -2,14 +2,21 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from evaluating import Painted, close, decibels, run_of
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
-from gsx.experiments.evaluation.chosen_views import neighbours
-from gsx.experiments.evaluation.cross_view import Differences, SurfaceView
+from gsx.core.training.backbone import DrawnSplats
+from gsx.experiments.evaluation.chosen_views import neighbour
+from gsx.experiments.evaluation.cross_view import Consistency, SurfaceView, detail_layer
+from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.evaluator import Evaluator
+from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.evaluation.warp import Surface, places_in, surface_of, warped
 
 SIZE = 96, 64
@@ -44,7 +51,8 @@ def plane(camera: Camera, square_at: float | None = None) -> SurfaceView:
         across = centre[:2] + nearer[..., None] * directions[..., :2]
         depth = torch.where(across.abs().amax(-1) < NEAR_SIDE, nearer, depth)
     surface = surface_of(camera, depth, torch.ones_like(depth))
-    return SurfaceView(surface=surface, pictures={"render": texture(centre + depth[..., None] * directions)})
+    picture = texture(centre + depth[..., None] * directions)
+    return SurfaceView(surface=surface, pictures={"render": picture}, size=(SIZE[1] // 2, SIZE[0] // 2))
 
 
 def noisy(view: SurfaceView, level: float, seed: int) -> SurfaceView:
@@ -53,10 +61,10 @@ def noisy(view: SurfaceView, level: float, seed: int) -> SurfaceView:
     return replace(view, pictures={"render": picture + noise})
 
 
-def consistency(source: SurfaceView, target: SurfaceView) -> dict[str, float]:
-    differences = Differences()
-    differences.add(source, target)
-    return differences.figures()
+def consistency(source: SurfaceView, target: SurfaceView) -> dict[str, Any]:
+    found = Consistency()
+    found.add(source, target)
+    return found.figures()
 
 
 def test_a_texture_of_the_world_is_consistent() -> None:
@@ -146,10 +154,61 @@ def test_points_behind_the_other_camera_are_left_out() -> None:
     assert len(places_in(behind, surface)[0]) == 0
 
 
-def test_neighbours_are_the_nearest_that_look_the_same_way() -> None:
-    """At x = 0, 1, 3; the one at 0.1 looks the other way, the last is alone in its direction."""
+def test_the_neighbour_is_the_nearest_that_looks_the_same_way_from_elsewhere() -> None:
+    """Of those at x = 0, 1, 3; the one at 0.1 looks the other way."""
     cameras = [camera_at(x, target=(x, 0.0, 0.0)) for x in (0.0, 1.0, 3.0)]
     cameras.append(camera_at(0.1, target=(0.1, 0.0, -8.0)))
-    assert neighbours(cameras, 8) == [(0, 1), (1, 0), (2, 1)]
-    assert neighbours(cameras, 1) == [(2, 1)]
-    assert neighbours(cameras, 0) == neighbours(cameras[:1], 8) == []
+    assert [neighbour(camera, cameras) for camera in cameras] == [1, 0, 1, None]
+    assert neighbour(cameras[0], []) is None
+
+
+def test_detail_is_what_half_the_size_cannot_hold() -> None:
+    x = torch.arange(SIZE[0], dtype=torch.float64).expand(3, SIZE[1], SIZE[0])
+    fine, coarse = 0.1 * (-1.0) ** x, 0.1 * torch.sin(2 * math.pi * x / 32)
+    size = SIZE[1] // 2, SIZE[0] // 2
+    inner = slice(8, -8)
+    assert (detail_layer(fine, size) - fine)[..., inner].abs().max() < 0.01
+    assert detail_layer(coarse, size)[..., inner].abs().max() < 0.01
+
+
+def test_detail_of_the_world_is_correlated_and_that_of_each_picture_is_not() -> None:
+    """Shifted by whole pixels of both sizes; half of the power of the detail in common is a correlation of a half."""
+    camera = replace(camera_at(0.0), rotation=torch.eye(3), translation=torch.tensor([0.0, 0.0, 4.0]))
+    moved = replace(camera, translation=torch.tensor([-4 * 4 / camera.fx, 0.0, 4.0]))
+    world = 0.1 * torch.randn(3, SIZE[1], SIZE[0] + 4, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    views = [replace(plane(one), pictures={"render": picture}) for one, picture in windows(camera, moved, world)]
+    assert consistency(*views)["detail"]["render"] > 0.99
+    mixed = [noisy(view, 0.1, seed) for seed, view in enumerate(views)]
+    assert consistency(*mixed)["detail"]["render"] == pytest.approx(0.5, abs=0.03)
+    alone = [noisy(replace(view, pictures={"render": 0 * world[..., 4:]}), 0.1, n) for n, view in enumerate(views)]
+    assert abs(consistency(*alone)["detail"]["render"]) < 0.03
+
+
+def windows(camera: Camera, moved: Camera, world: Tensor) -> list[tuple[Camera, Tensor]]:
+    """Both cameras with their windows of a picture of the plane."""
+    return [(camera, world[..., :-4]), (moved, world[..., 4:])]
+
+
+class Solid(Painted):
+    """Shows the grey of each view with an alpha of 0.99."""
+
+    def draw(self, camera: Camera, step: int) -> DrawnSplats:
+        drawn = super().draw(camera, step)
+        splats = drawn.splats
+        solid = replace(splats, log_opacities=0 * splats.log_opacities, colours=splats.colours / 2 / 0.99)
+        return replace(drawn, splats=solid)
+
+
+def test_an_evaluation_has_the_consistency_of_its_views(tmp_path: Path) -> None:
+    """Views of one grey each: 110 and 70 at x2, 100 and 60 enlarged, 104 and 71 in truth; c has no truth there."""
+    run = run_of(tmp_path)
+    run.backbone.__class__ = Solid
+    lpips = LpipsOptions(trunk="", head="", net="vgg", input_range="unit")
+    options = EvalOptions(zoom=[1, 2], quantise=True, ssim="valid", tile_pixels=1 << 20, lpips=lpips)
+    zoom = Evaluator(run, options).evaluate()["zoom"]
+    found = zoom["2"]["consistency"]
+    assert (found["render"], found["enlarged"], found["truth"]) == tuple(map(close, map(decibels, (40, 40, 33))))
+    assert 0.1 < found["pixels"] < 1
+    assert "consistency" not in zoom["1"]
+    none = Evaluator(run, replace(options, pairs=0)).evaluate()["zoom"]
+    assert none["2"].keys() == zoom["2"].keys() - {"consistency"}

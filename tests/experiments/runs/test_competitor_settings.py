@@ -119,13 +119,16 @@ def evaluation_of(folder: Path) -> dict[str, Any]:
 
 def test_the_log_says_win_or_loss_against_both() -> None:
     entry = {"psnr": 29.4, "enlarged_psnr": 28.7, "beats_enlarged": True, "upscaled_psnr": 29.55}
-    entry |= {"beats_upscaled": False, "consistency": {"render": 33.0, "enlarged": 35.5, "truth": 30.25, "pixels": 0.5}}
+    agreement = {"render": 33.0, "enlarged": 35.5, "truth": 30.25, "pixels": 0.5}
+    agreement |= {"detail": {"render": 0.75, "enlarged": 0.8, "truth": 0.5}}
+    entry |= {"beats_upscaled": False, "consistency": agreement}
     kinds = {"render": 0.2, "enlarged": -0.01, "upscaled": 0.05, "photograph": 0.1}
     entry |= {"detail": {kind: {"explained": share} for kind, share in kinds.items()}}
     assert zoom_lines("4", entry, "span") == [
         "zoom x4: 29.40 dB, wins against the enlarged x1 render (28.70 dB), loses to the x1 render enlarged by span "
         "(29.55 dB); detail +0.200 (x1 enlarged: -0.010, by span: +0.050, photo: +0.100)",
-        "zoom x4: neighbouring views agree to 33.00 dB (x1 enlarged: 35.50 dB, photos: 30.25 dB)",
+        "zoom x4: neighbouring views agree to 33.00 dB, detail 0.75 (x1 enlarged: 35.50 dB, detail 0.80; "
+        "photos: 30.25 dB, detail 0.50)",
     ]
     bare = {"psnr": 29.4, "enlarged_psnr": 28.7, "beats_enlarged": True}
     assert zoom_lines("4", bare, "span") == ["zoom x4: 29.40 dB, wins against the enlarged x1 render (28.70 dB)"]

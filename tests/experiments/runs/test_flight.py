@@ -13,9 +13,9 @@ from gsx.core.data.camera import look_at
 from gsx.core.errors import InputError, TooManyPairs
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
+from gsx.experiments.evaluation import evaluated_renders
 from gsx.experiments.reports.pictures import colour_ramp
 from gsx.experiments.runs import evaluate as evaluation
-from gsx.experiments.runs import flight as drawing
 from gsx.experiments.runs.flight import FRAMES, LONGEST, depth_colours, flight
 
 CAMERA = look_at([0, -4, 1], [0, 0, 0], fov_x=0.9, width=640, height=480)
@@ -55,11 +55,11 @@ def test_depth_is_that_of_the_rasterizer_without_what_stands_behind_the_scene(mo
         log_opacities=torch.cat([splats.log_opacities, torch.tensor([-0.01])]),
         colours=torch.cat([splats.colours, torch.ones(1, 3)]),
     )
-    monkeypatch.setattr(drawing, "splats_for", lambda run, camera: with_sky)
+    monkeypatch.setattr(evaluated_renders, "splats_for", lambda run, camera: with_sky)
     last = len(splats.means)
-    monkeypatch.setattr(drawing, "behind_scene", lambda backbone, means: torch.arange(len(means)) == last)
+    monkeypatch.setattr(evaluated_renders, "behind_scene", lambda backbone, means: torch.arange(len(means)) == last)
     run = SimpleNamespace(raster=rules, scene=small_scene(splats.means), backbone=None)
-    depth, coverage = drawing.depth_and_coverage(run, camera, 1 << 20)
+    depth, coverage = evaluated_renders.depth_and_coverage(run, camera, 1 << 20)
     drawn = rasterize(splats, camera, rules, depth=True)
     torch.testing.assert_close(depth, drawn.depth, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(coverage, drawn.alpha, rtol=1e-5, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Choice of held-out views: some of all, evenly spread, and the neighbour of each."""
+"""Choice of views: some of all, evenly spread, and the neighbour of one."""
 
 import math
 from collections.abc import Sequence
@@ -20,16 +20,14 @@ def evenly(items: Sequence[T], count: int) -> list[T]:
     return [items[(2 * part + 1) * len(items) // (2 * count)] for part in range(count)]
 
 
-def neighbours(cameras: Sequence[Camera], count: int) -> list[tuple[int, int]]:
-    """Pairs up to `count` cameras, evenly spread, with the nearest one that looks the same way; leaves out the lone.
+def neighbour(camera: Camera, others: Sequence[Camera]) -> int | None:
+    """Returns the index of the nearest other camera that looks the same way, at another place; None: there is none.
 
     Two cameras look the same way if their directions differ by at most LARGEST_TURN.
     """
-    if len(cameras) < 2:
-        return []
-    centres = torch.stack([camera.centre.double() for camera in cameras])
-    directions = torch.stack([camera.rotation[2].double() for camera in cameras])
-    distances = (centres[:, None] - centres).norm(dim=2).fill_diagonal_(math.inf)
-    distances[directions @ directions.T < math.cos(math.radians(LARGEST_TURN))] = math.inf
-    chosen = evenly(range(len(cameras)), count)
-    return [(number, int(distances[number].argmin())) for number in chosen if distances[number].min() < math.inf]
+    if not others:
+        return None
+    distances = torch.stack([other.centre.double() for other in others]).sub(camera.centre.double()).norm(dim=1)
+    same_way = torch.stack([other.rotation[2].double() for other in others]) @ camera.rotation[2].double()
+    distances[(same_way < math.cos(math.radians(LARGEST_TURN))) | (distances == 0)] = math.inf
+    return int(distances.argmin()) if distances.min() < math.inf else None

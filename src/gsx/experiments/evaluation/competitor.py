@@ -80,7 +80,7 @@ def request_of(run: Run, image: Float[Tensor, "3 h w"], view: View, scale: int) 
         reduction=run.scene.reduction,
         camera=view.camera,
         view=view,
-        number=run.scene.test.index(view),
+        number=next((number for number, one in enumerate(run.train_views) if one.name == view.name), 0),
         photo=False,
         seed=0,
         strength=1.0,

@@ -1,27 +1,31 @@
-"""Consistency of neighbouring held-out views: does the detail of one lie where the other shows it?
+"""Consistency of neighbouring views: does the detail of one lie where the other shows it?
 
-A view is warped into its neighbour by the model's depth. Real detail lies on surfaces, so both pictures agree; detail
-that is invented for each picture does not. A blurred picture agrees as well: read it with the explained detail.
+A held-out view is warped into its neighbour by the model's depth. Detail on surfaces agrees in both pictures; detail
+that is invented for each picture does not. A blurred picture agrees as well, so detail alone is also correlated.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
 
-from gsx.core.data.resize import to_uint8
+from gsx.core.data.scene import View
 from gsx.core.quality.metrics import decibel
-from gsx.core.shapes import Float, UInt8
-from gsx.core.training.render import render
+from gsx.core.shapes import Float, Int
 from gsx.core.training.run import Run
-from gsx.experiments.evaluation.chosen_views import neighbours
+from gsx.experiments.evaluation.chosen_views import evenly, neighbour
 from gsx.experiments.evaluation.eval_options import EvalOptions
-from gsx.experiments.evaluation.evaluated_renders import EvaluatedRenders
+from gsx.experiments.evaluation.evaluated_renders import EvaluatedRenders, depth_and_coverage
 from gsx.experiments.evaluation.warp import Surface, places_in, surface_of, warped
 from gsx.experiments.evaluation.zoomed import Zoomed
 
 COMPARED = ("render", "enlarged", "upscaled", "truth")
 """Pictures of a zoomed view whose consistency is measured."""
+Zoom: TypeAlias = Callable[[View, float], Zoomed | None]
+"""Returns a view at a zoom; None: it has no truth there."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -29,23 +33,80 @@ class SurfaceView:
     """A zoomed view's surface and its pictures."""
 
     surface: Surface
-    pictures: dict[str, UInt8[Tensor, "3 H W"] | Float[Tensor, "3 H W"]]
-    """Pictures by name (COMPARED), as bytes where they are quantised."""
-
-    def picture(self, name: str) -> Float[Tensor, "3 H W"]:
-        """Returns a picture, float64."""
-        picture = self.pictures[name]
-        return picture.double() / 255 if picture.dtype == torch.uint8 else picture.double()
+    pictures: dict[str, Float[Tensor, "3 H W"]]
+    """Pictures by name (COMPARED)."""
+    size: tuple[int, int]
+    """(height, width) at the training resolution, px."""
 
 
 @dataclass(kw_only=True)
-class Differences:
-    """Sums over pairs of views."""
+class Sums:
+    """Sums over the compared pixels of one kind of picture."""
 
-    squares: dict[str, float] = field(default_factory=dict)
-    """Sum of squared differences over pixels and channels, by picture."""
-    counts: dict[str, int] = field(default_factory=dict)
-    """Pixels with that picture in both views."""
+    pixels: int = 0
+    squares: float = 0.0
+    """Squared differences."""
+    products: float = 0.0
+    """Products of both pictures' detail."""
+    powers: tuple[float, float] = (0.0, 0.0)
+    """Squares of the detail, of the warped picture and of the other."""
+
+    def add(
+        self, source: Float[Tensor, "3 H W"], target: Float[Tensor, "3 H W"], match: "Match", size: tuple[int, int]
+    ) -> None:
+        """Warps a picture and compares it with another, as they are and by their detail."""
+        one, other = match.colours(source, target)
+        self.squares += float((one - other).square().sum())
+        one, other = match.colours(detail_layer(source, size), detail_layer(target, size))
+        self.products += float((one * other).sum())
+        self.powers = self.powers[0] + float(one.square().sum()), self.powers[1] + float(other.square().sum())
+        self.pixels += len(match.indices)
+
+    @property
+    def psnr(self) -> float:
+        """Returns the PSNR of one picture against the other, dB."""
+        return decibel(self.squares / (3 * self.pixels))
+
+    @property
+    def correlation(self) -> float:
+        """Returns the correlation of both pictures' detail; 0 without any."""
+        power = math.sqrt(self.powers[0] * self.powers[1])
+        return self.products / power if power > 0 else 0.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Match:
+    """Pixels of a view that another view shows as well."""
+
+    indices: Int[Tensor, "P"]
+    """Row-major indices."""
+    places: Float[Tensor, "2 P"]
+    """Their places in the other view, px."""
+
+    def colours(
+        self, source: Float[Tensor, "3 H W"], target: Float[Tensor, "3 H W"]
+    ) -> tuple[Float[Tensor, "3 P"], Float[Tensor, "3 P"]]:
+        """Returns the colours of the pixels by the other view's picture, and by their own, float64."""
+        return warped(source, self.places), target.flatten(1)[:, self.indices].double()
+
+
+def detail_layer(picture: Float[Tensor, "3 H W"], size: tuple[int, int]) -> Float[Tensor, "3 H W"]:
+    """Returns what is lost of a picture if it is reduced to a (height, width) and enlarged again, both bicubic."""
+    height, width = picture.shape[1:]
+    return picture - resized(resized(picture, size), (height, width))
+
+
+def resized(picture: Float[Tensor, "3 H W"], size: tuple[int, int]) -> Float[Tensor, "3 h w"]:
+    """Resizes by antialiased cubic interpolation."""
+    return torch.nn.functional.interpolate(picture[None], size=size, mode="bicubic", antialias=True)[0]
+
+
+@dataclass(kw_only=True)
+class Consistency:
+    """Agreement of pairs of views at one zoom."""
+
+    sums: dict[str, Sums] = field(default_factory=dict)
+    """Sums by picture."""
     pixels: int = 0
     """Compared pixels."""
     total: int = 0
@@ -54,64 +115,59 @@ class Differences:
     def add(self, source: SurfaceView, target: SurfaceView) -> None:
         """Warps the source's pictures into the target and compares them with its own."""
         indices, places = places_in(source.surface, target.surface)
+        match = Match(indices=indices, places=places)
         for name in target.pictures.keys() & source.pictures.keys():
-            own = target.picture(name).flatten(1)[:, indices]
-            square = float((warped(source.picture(name), places) - own).square().sum())
-            self.squares[name] = self.squares.get(name, 0.0) + square
-            self.counts[name] = self.counts.get(name, 0) + len(indices)
+            sums = self.sums.setdefault(name, Sums())
+            sums.add(source.pictures[name], target.pictures[name], match, target.size)
         self.pixels += len(indices)
         self.total += target.surface.visible.numel()
 
-    def figures(self) -> dict[str, float]:
-        """Returns PSNR by picture, dB, and the share of compared pixels; empty without any."""
+    def figures(self) -> dict[str, object]:
+        """Returns PSNR in dB and correlation of detail by picture, and the share of compared pixels; empty without."""
         if not self.pixels:
             return {}
-        whole = [name for name in COMPARED if self.counts.get(name) == self.pixels]
-        levels = {name: decibel(self.squares[name] / (3 * self.pixels)) for name in whole}
-        return levels | {"pixels": self.pixels / self.total}
+        known = {name: self.sums[name] for name in COMPARED if name in self.sums}
+        whole = {name: sums for name, sums in known.items() if sums.pixels == self.pixels}
+        levels: dict[str, object] = {name: sums.psnr for name, sums in whole.items()}
+        detail = {name: sums.correlation for name, sums in whole.items()}
+        return levels | {"pixels": self.pixels / self.total, "detail": detail}
 
 
 class CrossViews:
-    """Pairs of neighbouring views at each zoom; keeps the pictures of a view until its pairs are compared."""
+    """Consistency of some held-out views with their neighbours at each zoom above 1."""
 
-    def __init__(self, run: Run, options: EvalOptions, renders: EvaluatedRenders) -> None:
-        self.run, self.options, self.renders = run, options, renders
-        self.pairs = {factor: self.choose(factor) for factor in options.zoom if factor > 1}
-        """Pairs that wait for a picture, by zoom."""
-        self.kept: dict[float, dict[int, SurfaceView]] = {factor: {} for factor in self.pairs}
-        self.differences = {factor: Differences() for factor in self.pairs}
+    def __init__(self, run: Run, options: EvalOptions, renders: EvaluatedRenders, zoom: Zoom) -> None:
+        self.run, self.options, self.renders, self.zoom = run, options, renders, zoom
+        self.neighbours = {factor: self.choose(factor) for factor in options.zoom if factor > 1}
+        """Neighbour of each chosen view, by zoom."""
+        self.found = {factor: Consistency() for factor in self.neighbours}
 
-    def choose(self, factor: float) -> list[tuple[int, int]]:
-        """Returns up to `eval.pairs` pairs of test views with a truth at a zoom."""
-        test = self.run.scene.test
-        known = [number for number, view in enumerate(test) if view.zoom(factor) is not None]
-        pairs = neighbours([self.renders.camera(test[number]) for number in known], self.options.pairs)
-        return [(known[one], known[other]) for one, other in pairs]
+    def choose(self, factor: float) -> dict[int, View]:
+        """Returns the neighbours of up to `eval.pairs` held-out views by number; all have a truth at that zoom."""
+        test = [view for view in self.run.scene.test if view.zoom(factor) is not None]
+        train = [] if self.options.right_halves else self.run.train_views  # whose right halves may be masked
+        others = [*test, *(view for view in train if view.zoom(factor) is not None)]
+        chosen, cameras = evenly(test, self.options.pairs), [view.camera for view in others]
+        pairs = {self.run.scene.test.index(view): neighbour(view.camera, cameras) for view in chosen}
+        return {number: others[near] for number, near in pairs.items() if near is not None}
 
     def add(self, number: int, zoomed: Zoomed) -> None:
-        """Receives a view; compares the pairs that are now complete."""
-        pairs, kept = self.pairs.get(zoomed.factor, []), self.kept.get(zoomed.factor, {})
-        if not any(number in pair for pair in pairs):
-            return
-        kept[number] = self.surface_view(zoomed)
-        for pair in [pair for pair in pairs if kept.keys() >= {*pair}]:
-            self.differences[zoomed.factor].add(*(kept[one] for one in pair))
-            pairs.remove(pair)
-        for done in kept.keys() - {one for pair in pairs for one in pair}:
-            del kept[done]
+        """Receives a held-out view; compares it with its neighbour if it is a chosen one."""
+        near = self.neighbours.get(zoomed.factor, {}).get(number)
+        other = None if near is None else self.zoom(near, zoomed.factor)
+        if near is not None and other is not None:
+            source = self.surface_view(zoomed, self.run.scene.test[number])
+            self.found[zoomed.factor].add(source, self.surface_view(other, near))
 
-    def surface_view(self, zoomed: Zoomed) -> SurfaceView:
+    def surface_view(self, zoomed: Zoomed, view: View) -> SurfaceView:
         """Renders the depth of a zoomed view."""
         camera = self.renders.camera(zoomed.view)
-        tiled = render(self.run, camera, self.options.tile_pixels, supersample=1, depth=True)
-        assert tiled.depth is not None
-        pictures = zoomed.pictures(COMPARED)
-        if self.options.quantise:
-            pictures = {name: to_uint8(picture) for name, picture in pictures.items()}
-        surface = surface_of(camera, tiled.depth, tiled.alpha, zoomed.counted)
-        return SurfaceView(surface=surface, pictures=pictures)
+        depth, alpha = depth_and_coverage(self.run, camera, self.options.tile_pixels)
+        surface = surface_of(camera, depth, alpha, zoomed.counted)
+        size = view.camera.height, view.camera.width
+        return SurfaceView(surface=surface, pictures=zoomed.pictures(COMPARED), size=size)
 
-    def figures(self, factor: float) -> dict[str, dict[str, float]]:
+    def figures(self, factor: float) -> dict[str, dict[str, object]]:
         """Returns the entry `consistency` of a zoom; empty where nothing was compared."""
-        found = self.differences[factor].figures() if factor in self.differences else {}
-        return {"consistency": found} if found else {}
+        figures = self.found[factor].figures() if factor in self.found else {}
+        return {"consistency": figures} if figures else {}

@@ -36,7 +36,7 @@ class EvalOptions:
     poses: str = "given"
     """given: poses of the scene; aligned: poses estimated with the model on left halves, evaluated on right halves."""
     pairs: Annotated[int, Range(0, 1 << 20)] = 8
-    """Pairs of neighbouring views whose consistency is measured at each zoom above 1; 0: none."""
+    """Test views whose consistency with a neighbour is measured at each zoom above 1; 0: none."""
     flight: bool = True
     """Draw a flight into the finest detail, for the report."""
     remedy: str = ""

@@ -1,6 +1,7 @@
 """Renders of held-out views as an evaluation compares them: aligned cameras, fitted colours, finer rasters."""
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -9,9 +10,10 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError
 from gsx.core.quality.colour_matrix import fit_colours, transform_colours
-from gsx.core.rasterizer import TiledRendering
+from gsx.core.rasterizer import TiledRendering, rasterize_tiled
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.render import render
+from gsx.core.training.backbone import behind_scene
+from gsx.core.training.render import coverage_and_depth, render, splats_for
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.modules.alignment import estimate_camera
@@ -91,3 +93,15 @@ def align_camera(run: Run, view: View) -> Camera:
         pictures = rendering.image, rendering.depth, rendering.alpha, view.image()
         camera = estimate_camera(camera, *pictures, left, prior=view.camera)
     return camera
+
+
+def depth_and_coverage(run: Run, camera: Camera, pixels: int) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """Return (blending-weighted sum of camera z, coverage) of all splats but those behind the scene.
+
+    They are drawn in place of colours, for which loops are compiled already.
+    """
+    splats = splats_for(run, camera)
+    both = coverage_and_depth(splats, behind_scene(run.backbone, splats.means), camera)
+    with_depth = replace(splats, colours=torch.cat([both, both[:, :1]], 1))
+    coverage, summed, _ = rasterize_tiled(with_depth, camera, run.raster, pixels=pixels).image
+    return summed, coverage

@@ -100,8 +100,7 @@ class Evaluator:
         start = time.perf_counter()
         tiled = self.renders.render(view)
         self.times.append(time.perf_counter() - start - tiled.gathering)
-        whole, counted = self.measured(self.renders.fit(view, tiled.image)), view.counted()
-        self.kept[view] = to_uint8(whole) if self.options.quantise else whole
+        whole, counted = self.keep(view, tiled.image), view.counted()
         image, truth = black_out(whole, counted), black_out(view.image(), counted)
         parts = self.evaluated_part(image), self.evaluated_part(truth)
         evaluated = self.renders.evaluated_pixels(view, counted)
@@ -126,13 +125,21 @@ class Evaluator:
         """Returns the part of a picture that counts, for metrics without masks."""
         return image[..., image.shape[2] // 2 :] if self.options.right_halves else image
 
+    def keep(self, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+        """Keeps an x1 render as it is measured, and returns it."""
+        whole = self.measured(self.renders.fit(view, image))
+        self.kept[view] = to_uint8(whole) if self.options.quantise else whole
+        return whole
+
     def whole(self, view: View) -> Float[Tensor, "3 H W"]:
-        """Returns the x1 render of a measured view."""
+        """Returns the x1 render of a view."""
+        if view not in self.kept:
+            self.keep(view, self.renders.render(view).image)
         kept = self.kept[view]
         return kept.float() / 255 if self.options.quantise else kept
 
     def zoomed(self, view: View, factor: float) -> Zoomed | None:
-        """Returns a measured view at `factor` times the resolution, or None where there is no truth."""
+        """Returns a view at `factor` times the resolution, or None where there is no truth."""
         finer = view.zoom(factor)
         if finer is None:
             return None
@@ -171,7 +178,7 @@ class Evaluator:
         if not views:
             return {f"{factor:g}": {"unavailable": NOT_MEASURED} for factor in self.options.zoom}
         found: dict[float, list[ZoomFigures]] = {factor: [] for factor in self.options.zoom}
-        cross = CrossViews(self.run, self.options, self.renders)
+        cross = CrossViews(self.run, self.options, self.renders, self.zoomed)
         for number, (view, own) in enumerate(zip(self.run.scene.test, views, strict=True)):
             if drawing is not None:
                 drawing.whole(number, view, self.whole(view))

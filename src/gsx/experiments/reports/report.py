@@ -178,7 +178,8 @@ def zoom_groups(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def consistency_rows(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Returns the consistency of neighbouring views at the zooms where it was measured."""
     found = [(row["factor"], part(row["entry"], "consistency")) for row in rows]
-    return [{"factor": factor} | levels for factor, levels in found if is_number(levels.get("render"))]
+    measured = [(factor, levels) for factor, levels in found if is_number(levels.get("render"))]
+    return [{"factor": factor, **levels, "detail": part(levels, "detail")} for factor, levels in measured]
 
 
 def perceptual_pictures(entry: dict[str, Any], names: Sequence[str]) -> dict[str, dict[str, float | None]]:

@@ -165,12 +165,14 @@ def perceptual_texts(result: dict[str, Any], names: dict[str, str]) -> Iterator[
 
 def consistency_lines(factor: str, result: dict[str, Any], upscaler: str) -> list[str]:
     """Return the consistency of neighbouring views at a zoom in words; none if it was not measured."""
-    levels = {kind: value for kind, value in part(result, "consistency").items() if kind != "pixels"}
-    if "render" not in levels:
-        return []
-    names = {"enlarged": "x1 enlarged", "upscaled": f"by {upscaler}", "truth": "photos"}
-    others = ", ".join(f"{names[kind]}: {level:.2f} dB" for kind, level in levels.items() if kind != "render")
-    return [f"zoom x{factor}: neighbouring views agree to {levels['render']:.2f} dB ({others})"]
+    found = part(result, "consistency")
+    names = {"render": "", "enlarged": "x1 enlarged: ", "upscaled": f"by {upscaler}: ", "truth": "photos: "}
+    texts = [
+        f"{name}{found[kind]:.2f} dB, detail {part(found, 'detail')[kind]:.2f}"
+        for kind, name in names.items()
+        if kind in found
+    ]
+    return [f"zoom x{factor}: neighbouring views agree to {texts[0]} ({'; '.join(texts[1:])})"] if texts else []
 
 
 MOST_VIEWS = 6

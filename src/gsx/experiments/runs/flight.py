@@ -1,17 +1,14 @@
 """Further pictures of a report: depth of held-out views, and a flight into the finest detail."""
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
-from gsx.core.rasterizer import rasterize_tiled
 from gsx.core.shapes import Float
-from gsx.core.training.backbone import behind_scene
-from gsx.core.training.render import coverage_and_depth, render, splats_for
+from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.experiments.evaluation.evaluated_renders import depth_and_coverage
 from gsx.experiments.reports.pictures import Pictures, colour_ramp
 
 FRAMES = 12
@@ -34,18 +31,6 @@ def add_depth(run: Run, pictures: Pictures, pixels: int) -> None:
         picture, limits = depth_colours(*depth_and_coverage(run, run.scene.test[number].camera, pixels))
         entry["files"]["depth"] = pictures.save(f"{pictures.names[number]}.depth", picture)
         entry["depth"] = limits
-
-
-def depth_and_coverage(run: Run, camera: Camera, pixels: int) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
-    """Return (blending-weighted sum of camera z, coverage) of all splats but those behind the scene.
-
-    They are drawn in place of colours, for which loops are compiled already.
-    """
-    splats = splats_for(run, camera)
-    both = coverage_and_depth(splats, behind_scene(run.backbone, splats.means), camera)
-    with_depth = replace(splats, colours=torch.cat([both, both[:, :1]], 1))
-    coverage, summed, _ = rasterize_tiled(with_depth, camera, run.raster, pixels=pixels).image
-    return summed, coverage
 
 
 def depth_colours(
