@@ -46,6 +46,6 @@ class FeatureDistance(nn.Module):
             features = stage(features)
             unit = features / (features.norm(dim=1, keepdim=True) + 1e-10)
             for number in range(len(images)):
-                difference = (unit[number] - unit[-1]).square() * head[:, None, None]
+                difference = (unit[number] - unit[-1]).square_().mul_(head[:, None, None])
                 totals[number] += float(difference.sum(0).mean())
         return totals

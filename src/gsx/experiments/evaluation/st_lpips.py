@@ -98,7 +98,7 @@ def parts_of(pooling: int, layers: list[tuple[int, int, int, int]], channels: in
     for width, kernel, stride, padding in layers:
         convolution = nn.Conv2d if stride == 1 else BlurredConv2d
         yield convolution(channels, width, kernel, 1, padding), 1 if stride == 1 else 2
-        yield nn.ReLU(), 1
+        yield nn.ReLU(inplace=True), 1
         channels = width
 
 
