@@ -5,6 +5,7 @@ import importlib
 import logging
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -18,6 +19,7 @@ from gsx.core.errors import InputError
 from gsx.experiments.evaluation import installed_weights, perceptual
 from gsx.experiments.evaluation.feature_distance import FeatureDistance
 from gsx.experiments.evaluation.installed_weights import MetricUnavailable, read_known
+from gsx.experiments.evaluation.lpips import Lpips, LpipsOptions, head_name, load_lpips, widths_of
 from gsx.experiments.evaluation.perceptual import (
     METRICS,
     MetricSettings,
@@ -162,6 +164,32 @@ def test_another_file_in_the_place_of_weights_is_not_used(tmp_path: Path, monkey
     monkeypatch.setattr(installed_weights, "known_weights", lambda: known)
     with pytest.raises(MetricUnavailable, match="instead of ffff: copy it"):
         installed_weights.installed_weights("m")
+
+
+def test_lpips_is_found_in_the_cache_of_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same figure as with the two files of `metrics.lpips`."""
+    torch.manual_seed(5)
+    network = Lpips("alex", "signed")
+    trunk = {f"features.{name.partition('.')[2]}": value for name, value in network.stages.state_dict().items()}
+    head = {head_name(number): torch.rand(width) for number, width in enumerate(widths_of("alex"))}
+    (tmp_path / "checkpoints").mkdir()
+    files, places = {}, {}
+    for role, tensors in (("trunk", trunk), ("head", head)):
+        files[role] = tmp_path / "checkpoints" / f"{role}.pth"
+        torch.save(tensors, files[role])
+        digest = hashlib.sha256(files[role].read_bytes()).hexdigest()
+        places[role] = {"hub": f"{role}.pth", "sha256": digest[:8]}
+    known = {"lpips_alex": {"metric": "LPIPS", "licence": "BSD", "remedy": "", "files": places}}
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr(installed_weights, "known_weights", lambda: known)
+    found = load_metrics(["lpips_alex"], replace(SETTINGS, input_range="signed")).metrics["lpips_alex"]
+    options = LpipsOptions(trunk=str(files["trunk"]), head=str(files["head"]), net="alex", input_range="signed")
+    image, target = pictures(40, 48)
+    assert found.metric.distances([image], target)[0] == pytest.approx(
+        load_lpips(options).distance(image, target), rel=1e-4
+    )
+    assert (found.provenance["input"], found.provenance["windows"]) == ("[-1,1]", "none")
+    assert found.provenance["weights"]["trunk"].startswith("torch's hub cache, trunk.pth, sha256 ")
 
 
 class Difference:

@@ -256,19 +256,24 @@ def test_settings_that_a_run_is_older_than_can_be_asked_for(tmp_path: Path) -> N
     config = compose(["backbone=mip_splatting", "augmenter=upscale"], plugins()).resolved
     del config["eval"]["colours"], config["training"]["exposure"], config["backbone"]["mip"]["views"]
     del config["eval"]["poses"], config["training"]["poses"]
+    del config["metrics"]["perceptual"], config["metrics"]["perceptual_pixels"]
     del config["scene"]["disturb"], config["augmenter"]["upscale"]["weight_map"]
     write_config(tmp_path / "config.yaml", config)
     words = ["eval.colours=fitted", "training.exposure.when=always", "backbone.mip.views=2", "scene.disturb.pose=2"]
     words += ["augmenter.upscale.weight_map=none", "eval.poses=aligned", "training.poses.when=auto"]
-    settings = read_config(tmp_path / "config.yaml", plugins(), words)
+    assert read_config(tmp_path / "config.yaml", plugins(), words).evaluation.perceptual == []
+    settings = read_config(tmp_path / "config.yaml", plugins(), [*words, "metrics.perceptual=[niqe]"])
     assert (settings.evaluation.colours, settings.modules["exposure"].options.when) == ("fitted", "always")
     assert (settings.evaluation.poses, settings.modules["poses"].options.when) == ("aligned", "auto")
+    assert (settings.evaluation.perceptual, settings.evaluation.perceptual_pixels) == (["niqe"], 131072)
     assert settings.backbone.options.mip.views == 2
     assert settings.resolved["eval"]["colours"] == "fitted"
     with pytest.raises(ConfigError, match=r"Did you mean 'eval.colours'"):
         read_config(tmp_path / "config.yaml", plugins(), ["eval.colors=fitted"])
     with pytest.raises(ConfigError, match=r"Unknown key 'eval.lpips.net'"):
         read_config(tmp_path / "config.yaml", plugins(), ["eval.lpips.net=alex"])
+    with pytest.raises(ConfigError, match=r"metrics.perceptual has 'niqee'; choose from st_lpips_alex, "):
+        read_config(tmp_path / "config.yaml", plugins(), [*words, "metrics.perceptual=[niqee]"])
     (tmp_path / "list.yaml").write_text("- 1\n")
     with pytest.raises(ConfigError):
         read_config(tmp_path / "list.yaml", plugins(), ["eval.colours=fitted"])

@@ -26,7 +26,7 @@ class EvalOptions:
     lpips: LpipsOptions
     perceptual: list[str] = field(default_factory=list)
     """Names of perceptual metrics, `metrics.perceptual`."""
-    perceptual_pixels: int = 0
+    perceptual_pixels: int = 1 << 17
     """Largest picture that networks measure as a whole, `metrics.perceptual_pixels`; 0: any."""
     supersample: Annotated[int, Range(0, 16)] = 0
     """Factor by which renders are finer than each picture before they are reduced; 0: as in training."""
