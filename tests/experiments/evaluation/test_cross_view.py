@@ -52,13 +52,13 @@ def plane(camera: Camera, square_at: float | None = None) -> SurfaceView:
         depth = torch.where(across.abs().amax(-1) < NEAR_SIDE, nearer, depth)
     surface = surface_of(camera, depth, torch.ones_like(depth))
     picture = texture(centre + depth[..., None] * directions)
-    return SurfaceView(surface=surface, pictures={"render": picture}, size=(SIZE[1] // 2, SIZE[0] // 2))
+    return SurfaceView(surface=surface, stored={"render": picture}, size=(SIZE[1] // 2, SIZE[0] // 2))
 
 
 def noisy(view: SurfaceView, level: float, seed: int) -> SurfaceView:
-    picture = view.pictures["render"]
+    picture = view.stored["render"]
     noise = level * torch.randn(picture.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    return replace(view, pictures={"render": picture + noise})
+    return replace(view, stored={"render": picture + noise})
 
 
 def consistency(source: SurfaceView, target: SurfaceView) -> dict[str, Any]:
@@ -84,7 +84,7 @@ def test_noise_in_the_target_alone_is_measured_as_it_is() -> None:
     source, target = plane(camera_at(-0.3)), plane(camera_at(0.3))
     drawn = noisy(target, 0.1, 1)
     indices, _ = places_in(source.surface, target.surface)
-    noise = (drawn.pictures["render"] - target.pictures["render"]).flatten(1)[:, indices]
+    noise = (drawn.stored["render"] - target.stored["render"]).flatten(1)[:, indices]
     assert consistency(source, drawn)["render"] == pytest.approx(-10 * math.log10(noise.square().mean()), abs=0.02)
 
 
@@ -104,7 +104,7 @@ def test_a_view_warps_into_itself_exactly() -> None:
     assert len(indices) == (SIZE[0] - 4) * (SIZE[1] - 4)
     centres = torch.stack([indices % SIZE[0], indices // SIZE[0]]) + 0.5
     assert torch.allclose(places, centres.double(), atol=1e-9, rtol=0)
-    picture = view.pictures["render"]
+    picture = view.stored["render"]
     assert torch.allclose(warped(picture, places), picture.flatten(1)[:, indices], atol=1e-9, rtol=0)
 
 
@@ -176,11 +176,11 @@ def test_detail_of_the_world_is_correlated_and_that_of_each_picture_is_not() -> 
     camera = replace(camera_at(0.0), rotation=torch.eye(3), translation=torch.tensor([0.0, 0.0, 4.0]))
     moved = replace(camera, translation=torch.tensor([-4 * 4 / camera.fx, 0.0, 4.0]))
     world = 0.1 * torch.randn(3, SIZE[1], SIZE[0] + 4, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    views = [replace(plane(one), pictures={"render": picture}) for one, picture in windows(camera, moved, world)]
+    views = [replace(plane(one), stored={"render": picture}) for one, picture in windows(camera, moved, world)]
     assert consistency(*views)["detail"]["render"] > 0.99
     mixed = [noisy(view, 0.1, seed) for seed, view in enumerate(views)]
     assert consistency(*mixed)["detail"]["render"] == pytest.approx(0.5, abs=0.03)
-    alone = [noisy(replace(view, pictures={"render": 0 * world[..., 4:]}), 0.1, n) for n, view in enumerate(views)]
+    alone = [noisy(replace(view, stored={"render": 0 * world[..., 4:]}), 0.1, n) for n, view in enumerate(views)]
     assert abs(consistency(*alone)["detail"]["render"]) < 0.03
 
 

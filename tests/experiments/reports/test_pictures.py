@@ -7,14 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 from torch.nn import Parameter
 
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.images import image_size, read_image
-from gsx.core.data.resize import linear_from_display
+from gsx.core.data.resize import linear_from_display, to_uint8
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.data.window import Window
 from gsx.core.gaussians.splats import Gaussians, Splats
@@ -28,6 +30,7 @@ from gsx.core.training.run import Progress, Run, TrainingOptions
 from gsx.core.training.sampler import Sampler
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.evaluation import evaluated_renders
+from gsx.experiments.evaluation.competitor import competitor_for
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.lpips import LpipsOptions
@@ -42,6 +45,7 @@ from gsx.experiments.reports.pictures import (
     reduced,
     spread,
 )
+from gsx.regenerators.classical import PlainOptions, Resampled
 
 WIDTH, HEIGHT = 80, 64
 
@@ -234,6 +238,24 @@ def test_crops_carry_the_psnr_of_what_is_shown(run: Run) -> None:
         truth, render, enlarged = (stored(run, entry["files"][kind]) for kind in ("truth", "render", "enlarged"))
         assert entry["psnr"] == pytest.approx(psnr(render, truth))
         assert entry["enlarged_psnr"] == pytest.approx(psnr(enlarged, truth))
+
+
+def test_crops_show_what_an_upscaler_makes_of_the_x1_render(tmp_path: Path) -> None:
+    """Lanczos' filter with three lobes, and PIL's."""
+    run = make_run(tmp_path, views=1)
+    options = replace(OPTIONS, zoom=[2], pairs=0)
+    competitor = competitor_for(run, "lanczos", lambda: Resampled(PlainOptions(name="lanczos")), options.zoom)
+    drawing = Pictures(run.folder / "renders", run.step)
+    Evaluator(run, options, competitor).evaluate(drawing)
+    drawing.write_index()
+    (entry,) = read_index(run)["zoom"]
+    upscaled, truth = (stored(run, entry["files"][kind]) for kind in ("upscaled", "truth"))
+    assert entry["upscaled_psnr"] == pytest.approx(psnr(upscaled, truth))
+    [view] = run.scene.test
+    whole = Image.fromarray(to_uint8(render(run, view.camera).image).permute(1, 2, 0).numpy())
+    larger = whole.resize((2 * whole.width, 2 * whole.height), Image.Resampling.LANCZOS)
+    expected = torch.from_numpy(numpy.array(larger)).permute(2, 0, 1) / 255
+    assert (upscaled - Window(*entry["window"]).cut(expected)).abs().max() <= 1.01 / 255
 
 
 def test_crops_show_the_detail(run: Run) -> None:

@@ -424,8 +424,20 @@ def test_the_table_of_a_sweep(sweep: Path) -> None:
     assert rows["failed"]["reason"] == "three non-finite steps"
     assert rows["garden/b"]["differences"] == "seed=1"
     assert rows["garden/b"]["zoom_gains"] == "x2:+0.500 x4:-1.500"
+    assert rows["garden/b"]["zoom_upscaled_gains"] == ""
     assert float(rows["garden/c"]["psnr"]) == 23.0
     assert rows["damaged"]["psnr"] == ""
+
+
+def test_an_overview_has_the_gain_over_the_upscaler(tmp_path: Path) -> None:
+    zoom = {"2": zoom_entry(23.5, 23.0) | {"upscaled_psnr": 23.75}, "4": zoom_entry(20.0, 21.5)}
+    make_run(tmp_path / "a", result=evaluation(zoom=zoom))
+    make_run(tmp_path / "b")
+    text = Page(write_overview(tmp_path)).text("runs")
+    assert "×2 over upscaler" in text
+    assert "×4 over upscaler" not in text
+    assert "+0.50 −1.50 −0.25" in text
+    assert [row["zoom_upscaled_gains"] for row in table(tmp_path).values()] == ["x2:-0.250", ""]
 
 
 def test_runs_of_one_scene_by_other_protocols_are_flagged(sweep: Path) -> None:

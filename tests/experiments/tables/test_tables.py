@@ -43,7 +43,8 @@ def write_run(place: Path, psnr: float | None) -> None:
     (place / "status.json").write_text(json.dumps({"state": "ok", "step": 10}))
     figures = {"psnr": psnr, "ssim": 0.5, "lpips": None, "visible_primitives": 1500.0, "megabytes": 2.25, "step": 10}
     groups = {"scale-1": {"psnr": psnr + 5, "ssim": 0.75, "lpips": None, "visible_primitives": 500.0}}
-    closer = {"psnr": psnr - 1, "enlarged_psnr": 19.5, "detail": {"render": {"explained": psnr / 100}}}
+    closer = {"psnr": psnr - 1, "enlarged_psnr": 19.5, "upscaled_psnr": 20.25}
+    closer |= {"detail": {"render": {"explained": psnr / 100}}}
     zoom = {"1": {"psnr": psnr}, "2": closer}
     evaluation = figures | {"train_seconds": 12.0, "groups": groups, "zoom": zoom}
     (place / "evaluation.json").write_text(json.dumps(evaluation))
@@ -128,6 +129,7 @@ def test_other_measures_groups_zooms_and_quoted_rows(table: Table) -> None:
     assert table.at("base", "Scene Two", "PSNR").ours == 30.0  # not in the paper's table: beside its figures
     assert table.at("base", "Scene One", "PSNR x2").ours == 20.0
     assert table.at("base", "Scene One", "over enlarged x2").ours == 0.5
+    assert table.at("base", "Scene One", "over upscaled x2").ours == -0.25
     assert table.at("base", "Scene One", "detail x2").ours == pytest.approx(0.21)
     assert "0.210 ± 0.010" in as_text(table)
     quoted = table.at("quoted", "Set & Co", "PSNR")
@@ -142,7 +144,7 @@ def test_other_measures_groups_zooms_and_quoted_rows(table: Table) -> None:
 
 def test_the_same_figures_in_every_form(table: Table) -> None:
     lines = list(csv.DictReader(io.StringIO(as_csv(table))))
-    assert len(lines) == 3 * 4 * 5  # rows; the three scopes and the other scene; PSNR, #GS, and three figures at x2
+    assert len(lines) == 3 * 4 * 6  # rows; the three scopes and the other scene; PSNR, #GS, and four figures at x2
     line = next(n for n in lines if (n["row"], n["scope"], n["metric"]) == ("base", "Set & Co", "PSNR"))
     assert (line["ours"], line["spread"], line["paper"], line["difference"]) == ("25.5", "0.5", "25.0", "0.5")
     assert next(n for n in lines if n["row"] == "quoted")["ours"] == ""

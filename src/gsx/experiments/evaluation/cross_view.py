@@ -12,6 +12,7 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
+from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.quality.metrics import decibel
 from gsx.core.shapes import Float, Int
@@ -33,10 +34,15 @@ class SurfaceView:
     """A zoomed view's surface and its pictures."""
 
     surface: Surface
-    pictures: dict[str, Float[Tensor, "3 H W"]]
-    """Pictures by name (COMPARED)."""
+    stored: dict[str, Tensor]
+    """Pictures by name (COMPARED), as bytes where they are quantised."""
     size: tuple[int, int]
     """(height, width) at the training resolution, px."""
+
+    def picture(self, name: str) -> Float[Tensor, "3 H W"]:
+        """Returns a picture."""
+        stored = self.stored[name]
+        return stored.float() / 255 if stored.dtype == torch.uint8 else stored
 
 
 @dataclass(kw_only=True)
@@ -116,9 +122,9 @@ class Consistency:
         """Warps the source's pictures into the target and compares them with its own."""
         indices, places = places_in(source.surface, target.surface)
         match = Match(indices=indices, places=places)
-        for name in target.pictures.keys() & source.pictures.keys():
+        for name in target.stored.keys() & source.stored.keys():
             sums = self.sums.setdefault(name, Sums())
-            sums.add(source.pictures[name], target.pictures[name], match, target.size)
+            sums.add(source.picture(name), target.picture(name), match, target.size)
         self.pixels += len(indices)
         self.total += target.surface.visible.numel()
 
@@ -134,38 +140,60 @@ class Consistency:
 
 
 class CrossViews:
-    """Consistency of some held-out views with their neighbours at each zoom above 1."""
+    """Consistency of some held-out views with their neighbours at each zoom above 1.
+
+    A held-out view that waits for its neighbour is kept; a neighbour of training is rendered when its turn has come.
+    """
 
     def __init__(self, run: Run, options: EvalOptions, renders: EvaluatedRenders, zoom: Zoom) -> None:
         self.run, self.options, self.renders, self.zoom = run, options, renders, zoom
-        self.neighbours = {factor: self.choose(factor) for factor in options.zoom if factor > 1}
-        """Neighbour of each chosen view, by zoom."""
-        self.found = {factor: Consistency() for factor in self.neighbours}
+        self.pairs = {factor: self.choose(factor) for factor in options.zoom if factor > 1}
+        """Pairs of (held-out view, neighbour) that are not compared yet, by zoom."""
+        self.kept: dict[float, dict[View, SurfaceView]] = {factor: {} for factor in self.pairs}
+        self.found = {factor: Consistency() for factor in self.pairs}
 
-    def choose(self, factor: float) -> dict[int, View]:
-        """Returns the neighbours of up to `eval.pairs` held-out views by number; all have a truth at that zoom."""
+    def choose(self, factor: float) -> list[tuple[View, View]]:
+        """Returns up to `eval.pairs` held-out views with their neighbours; all have a truth at that zoom."""
         test = [view for view in self.run.scene.test if view.zoom(factor) is not None]
         train = [] if self.options.right_halves else self.run.train_views  # whose right halves may be masked
         others = [*test, *(view for view in train if view.zoom(factor) is not None)]
         chosen, cameras = evenly(test, self.options.pairs), [view.camera for view in others]
-        pairs = {self.run.scene.test.index(view): neighbour(view.camera, cameras) for view in chosen}
-        return {number: others[near] for number, near in pairs.items() if near is not None}
+        near = [neighbour(view.camera, cameras) for view in chosen]
+        return [(view, others[index]) for view, index in zip(chosen, near, strict=True) if index is not None]
 
-    def add(self, number: int, zoomed: Zoomed) -> None:
-        """Receives a held-out view; compares it with its neighbour if it is a chosen one."""
-        near = self.neighbours.get(zoomed.factor, {}).get(number)
-        other = None if near is None else self.zoom(near, zoomed.factor)
-        if near is not None and other is not None:
-            source = self.surface_view(zoomed, self.run.scene.test[number])
-            self.found[zoomed.factor].add(source, self.surface_view(other, near))
+    def add(self, view: View, zoomed: Zoomed) -> None:
+        """Receives a held-out view; compares the pairs that are now complete."""
+        pairs = self.pairs.get(zoomed.factor, [])
+        if not any(view in pair for pair in pairs):
+            return
+        kept = self.kept[zoomed.factor]
+        kept[view] = self.surface_view(zoomed, view)
+        for pair in [(one, other) for one, other in pairs if one in kept and (other in kept or self.trained(other))]:
+            one, other = pair
+            self.found[zoomed.factor].add(kept[one], kept.get(other) or self.neighbour_view(other, zoomed.factor))
+            pairs.remove(pair)
+        for done in kept.keys() - {one for pair in pairs for one in pair}:
+            del kept[done]
+
+    def trained(self, view: View) -> bool:
+        """Returns whether a view is none of those held out."""
+        return view not in self.run.scene.test
+
+    def neighbour_view(self, view: View, factor: float) -> SurfaceView:
+        """Renders a training view."""
+        zoomed = self.zoom(view, factor)
+        assert zoomed is not None, "neighbours have a truth at that zoom"
+        return self.surface_view(zoomed, view)
 
     def surface_view(self, zoomed: Zoomed, view: View) -> SurfaceView:
         """Renders the depth of a zoomed view."""
         camera = self.renders.camera(zoomed.view)
         depth, alpha = depth_and_coverage(self.run, camera, self.options.tile_pixels)
         surface = surface_of(camera, depth, alpha, zoomed.counted)
-        size = view.camera.height, view.camera.width
-        return SurfaceView(surface=surface, pictures=zoomed.pictures(COMPARED), size=size)
+        pictures: dict[str, Tensor] = zoomed.pictures(COMPARED)
+        if self.options.quantise:
+            pictures = {name: to_uint8(picture) for name, picture in pictures.items()}
+        return SurfaceView(surface=surface, stored=pictures, size=(view.camera.height, view.camera.width))
 
     def figures(self, factor: float) -> dict[str, dict[str, object]]:
         """Returns the entry `consistency` of a zoom; empty where nothing was compared."""

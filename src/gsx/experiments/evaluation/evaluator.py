@@ -189,7 +189,7 @@ class Evaluator:
                 elif zoomed := self.zoomed(view, factor):
                     perceptual = self.perceptual.zoomed(zoomed, self.evaluated_part)
                     figures.append(measure_zoom(zoomed, self.ssim, perceptual))
-                    cross.add(number, zoomed)
+                    cross.add(view, zoomed)
                     if drawing is not None:
                         drawing.zoomed(number, zoomed)
                     advance(factor**2, f"{view.name} x{factor:g}")

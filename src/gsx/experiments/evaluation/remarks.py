@@ -91,9 +91,14 @@ def shares(counts: Mapping[str, int], requested: Mapping[str, int]) -> dict[str,
 
 
 def remarks_of(evaluation: Mapping[str, Any]) -> list[str]:
+    """Returns remarks on an evaluation.json: incidents, and losses to an upscaler."""
+    return [*incidents_of(evaluation), *upscaler_remarks(evaluation)]
+
+
+def incidents_of(evaluation: Mapping[str, Any]) -> list[str]:
     """Returns remarks on an evaluation.json; none for a run without incident."""
-    kinds = (split_remarks, start_remarks, cap_remarks, pseudo_remarks, left_out_remarks, upscaler_remarks)
-    return [remark for kind in (*kinds, saved_remarks) for remark in kind(evaluation)]
+    kinds = (split_remarks, start_remarks, cap_remarks, pseudo_remarks, left_out_remarks, saved_remarks)
+    return [remark for kind in kinds for remark in kind(evaluation)]
 
 
 def split_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:

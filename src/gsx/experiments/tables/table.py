@@ -8,7 +8,7 @@ from typing import Any
 
 from gsx.core.files import read_json
 from gsx.engine.cache import source_revision
-from gsx.experiments.evaluation.remarks import NOT_MEASURED, measures_nothing, remarks_of
+from gsx.experiments.evaluation.remarks import NOT_MEASURED, incidents_of, measures_nothing
 from gsx.experiments.reports.baselines import spread
 from gsx.experiments.run_folder.files import (
     RunFiles,
@@ -245,7 +245,7 @@ def figure(
 
 def remarks_on(cell: Cell, files: dict[Path, RunFiles]) -> list[str]:
     """Lists the remarks on a run, with its row and scene."""
-    return [f"{cell.row}, {cell.scene}: {remark}" for remark in remarks_of(files[cell.folder].evaluation)]
+    return [f"{cell.row}, {cell.scene}: {remark}" for remark in incidents_of(files[cell.folder].evaluation)]
 
 
 def measured(files: RunFiles, metric: str, group: str) -> float | None:
