@@ -16,8 +16,14 @@ def line_figures(line: dict[str, Any]) -> dict[str, float]:
 
 
 def evaluation_figures(evaluation: dict[str, Any]) -> dict[str, float]:
-    """Returns the numbers of evaluation.json without its step: `evaluation/psnr`, by zoom `evaluation/x2/psnr`."""
-    figures = numbers(evaluation, "evaluation/")
+    """Returns the numbers of evaluation.json without its step: `evaluation/psnr`, by zoom `evaluation/x2/psnr`.
+
+    Perceptual figures are `evaluation/METRIC`, `evaluation/x2/METRIC` and `evaluation/x2/enlarged_METRIC`.
+    """
+    figures = numbers(evaluation, "evaluation/") | numbers(evaluation.get("perceptual", {}), "evaluation/")
     for factor, result in evaluation.get("zoom", {}).items():
         figures |= numbers(result, f"evaluation/x{factor}/")
+        for metric, pictures in result.get("perceptual", {}).items():
+            names = {"" if kind == "render" else f"{kind}_": value for kind, value in pictures.items()}
+            figures |= {f"evaluation/x{factor}/{name}{metric}": value for name, value in names.items()}
     return {name: value for name, value in figures.items() if name != "evaluation/step"}

@@ -319,6 +319,13 @@ def test_numbers_are_named_as_in_the_files() -> None:
     zoom = {"2": {"psnr": 20.0, "beats_enlarged": True}, "4": {"unavailable": "no truth"}}
     evaluation = {"step": 7, "psnr": 21.0, "lpips": None, "zoom": zoom, "protocol": {"hash": "x"}, "views": []}
     assert evaluation_figures(evaluation) == {"evaluation/psnr": 21.0, "evaluation/x2/psnr": 20.0}
+    zoom["2"]["perceptual"] = {"st_lpips_alex": {"render": 0.25, "enlarged": 0.5}}
+    perceptual = {"perceptual": {"st_lpips_alex": 0.125, "niqe": None}}
+    assert evaluation_figures(evaluation | perceptual) == evaluation_figures(evaluation) | {
+        "evaluation/st_lpips_alex": 0.125,
+        "evaluation/x2/st_lpips_alex": 0.25,
+        "evaluation/x2/enlarged_st_lpips_alex": 0.5,
+    }
 
 
 def test_nothing_is_asked_of_the_network_and_little_is_said(tracked: Tracked) -> None:
