@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.window import Window
+from gsx.core.shapes import Float
 from gsx.core.training.backbone import Observation, PseudoViewListener
 from gsx.core.training.parameter_table import shared_colour
 from gsx.core.training.pseudo_views import PseudoView, Term, mask_windows, pseudo_loss
@@ -56,7 +57,7 @@ def backward_term(run: Run, term: Term, step: int, observations: list[Observatio
     total = 0.0
     for view, weight in term.parts:
         drawn, rendering, _ = render_for_training(run, view.camera, step, run.background)
-        loss = weight * pseudo_loss(rendering.image, view, term.squared, term.ssim_weight)
+        loss = weight * difference_from(run, rendering.image, view, term)
         loss.backward()
         total += float(loss.detach())
         gradient = rendering.screen.means2d_offset.grad  # not finite in a step that will be skipped
@@ -69,9 +70,15 @@ def backward_term(run: Run, term: Term, step: int, observations: list[Observatio
     return total
 
 
-def reused_losses(renders: Sequence[CameraImage], divided: Sequence[Divided]) -> Iterator[tuple[str, Tensor]]:
+def difference_from(run: Run, image: Float[Tensor, "3 h w"], view: PseudoView, term: Term) -> Float[Tensor, ""]:
+    """Returns the loss of a render of a pseudo view as its term measures it, compiled where renders are."""
+    backend = run.raster.backend.on(image.device.type, learning=True)
+    return pseudo_loss(image, view, term.squared, term.ssim_weight, backend)
+
+
+def reused_losses(run: Run, renders: Sequence[CameraImage], divided: Sequence[Divided]) -> Iterator[tuple[str, Tensor]]:
     """Yields (name of the term, loss) of each pseudo view that is compared with a render of the training view."""
     for term, reused in divided:
         for pseudo, weight in reused:
             image = next(image for camera, image in renders if pseudo.camera.draws_as(camera))
-            yield term.name, weight * pseudo_loss(image, pseudo, term.squared, term.ssim_weight)
+            yield term.name, weight * difference_from(run, image, pseudo, term)

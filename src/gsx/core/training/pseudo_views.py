@@ -7,10 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsx.core.backend import EAGER, Backend
 from gsx.core.data.camera import Camera
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.window import Window
-from gsx.core.quality.losses import ssim_map
+from gsx.core.quality.losses import photometric, ssim_map
 from gsx.core.shapes import Float, UInt8
 
 
@@ -56,7 +57,11 @@ class Term:
 
 
 def pseudo_loss(
-    image: Float[Tensor, "3 h w"], view: PseudoView, squared: bool = False, ssim_weight: float = 0.0
+    image: Float[Tensor, "3 h w"],
+    view: PseudoView,
+    squared: bool = False,
+    ssim_weight: float = 0.0,
+    backend: Backend = EAGER,
 ) -> Float[Tensor, ""]:
     """Returns the weighted mean |render - target|, plus that from `view.coarse` (SRGS).
 
@@ -64,13 +69,18 @@ def pseudo_loss(
         image: Render by the view's camera.
         view: Pseudo view.
         squared: Squared differences.
-        ssim_weight: w of (1 - w) differences + w (1 - SSIM); pixel weights multiply the map of SSIM (SplatSuRe).
+        ssim_weight: Above 0: the photos' loss with that weight of 1 - SSIM; pixel weights multiply its map (SplatSuRe).
+        backend: `RasterSettings.backend.on(device, learning=True)`.
     """
     size = torch.square if squared else torch.abs
     target = view.target.to(image.device).float() / 255
-    loss = weighted(size(image - target), view).mean()
-    if ssim_weight:
-        loss = (1 - ssim_weight) * loss + ssim_weight * weighted(1 - ssim_map(image, target), view).mean()
+    if not ssim_weight:
+        loss = weighted(size(image - target), view).mean()
+    elif view.pixel_weight is None:
+        loss = photometric(image, target, ssim_weight, backend)
+    else:
+        maps = (1 - ssim_weight) * (image - target).abs() + ssim_weight * (1 - ssim_map(image, target))
+        loss = weighted(maps, view).mean()
     if view.coarse is None:
         return loss
     reduced = view.reduction.reduce(image, view.camera.width // view.coarse.shape[2])

@@ -145,7 +145,7 @@ def view_loss(run: Run, step: int, view: View, terms: Sequence[Term], colour: Fl
         loss = loss + extra
     loss = loss if own == 1 else own * loss
     named = {"own": float(loss.detach())} | parts if parts else {}
-    for name, value in reused_losses([(view.camera, rendering.image), finer], divided):
+    for name, value in reused_losses(run, [(view.camera, rendering.image), finer], divided):
         named[name] += float(value.detach())
         loss = loss + value
     loss.backward()
