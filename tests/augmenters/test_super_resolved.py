@@ -40,7 +40,7 @@ def test_the_photos_loss_of_a_pseudo_view() -> None:
 
 
 def test_one_render_serves_both_losses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """0.5 photometric(reduced render, photo) + 0.5 photometric(render, enlarged photo), with its gradients."""
+    """0.2 photometric(reduced render, photo) + 0.8 photometric(render, enlarged photo), with its gradients."""
     run = run_at(tmp_path / "run", 1, *TOGETHER)
     picked = run.sampler.count - 1
     run.sampler.order = [picked]
@@ -60,7 +60,7 @@ def test_one_render_serves_both_losses(tmp_path: Path, monkeypatch: pytest.Monke
     splats = run.backbone.draw(view.camera, run.step + 1).splats
     image = rasterize(splats, view.camera.zoom(2), run.raster, background=run.background).image
     own = photometric(run.scene.reduction.unclamped(image, 2), view.image(), 0.2)
-    loss = 0.5 * own + 0.5 * photometric(image, pseudo.target.float() / 255, 0.2)
+    loss = 0.2 * own + 0.8 * photometric(image, pseudo.target.float() / 255, 0.2)
     loss.backward()
     assert float(step.loss) == pytest.approx(float(loss.detach()), rel=1e-5)
     for name, gradient in gradients(run.backbone.table).items():
