@@ -88,7 +88,7 @@ def test_code_that_it_names_runs_only_if_the_command_line_names_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """gsx eval of a folder from elsewhere."""
-    (tmp_path / "theirs.py").write_text(
+    (tmp_path / "their_upscaler.py").write_text(
         "from pathlib import Path\n"
         "Path('was_here').touch()\n"
         "def blocks(image, scale, **more): return image.repeat_interleave(scale, 1).repeat_interleave(scale, 2)\n"
@@ -96,15 +96,15 @@ def test_code_that_it_names_runs_only_if_the_command_line_names_it(
     monkeypatch.chdir(tmp_path)
     folder = tiny_run(tmp_path / "run", [*LIGHT, "iterations=1", CALLABLE]).folder
     config = folder / "config.yaml"
-    config.write_text(config.read_text().replace("function: ''", "function: theirs:blocks"))
+    config.write_text(config.read_text().replace("function: ''", "function: their_upscaler:blocks"))
     zoomed = "eval.zoom=[1,2]"
     assert main(["eval", str(folder), zoomed]) == 2
-    assert "runs code with your permissions, eval.competitor: 'theirs:blocks'" in capsys.readouterr().err
+    assert "runs code with your permissions, eval.competitor: 'their_upscaler:blocks'" in capsys.readouterr().err
     assert not (tmp_path / "was_here").exists()
     shutil.copytree(folder, tmp_path / "other")
     assert main(["eval", str(tmp_path / "other"), zoomed, "eval.competitor=null"]) == 0
     assert "competitor" not in evaluation_of(tmp_path / "other")
-    assert main(["eval", str(folder), zoomed, "eval.competitor.function='theirs:blocks'"]) == 0
+    assert main(["eval", str(folder), zoomed, "eval.competitor.function='their_upscaler:blocks'"]) == 0
     evaluation = evaluation_of(folder)
     assert evaluation["competitor"] == {"name": "callable"}
     assert evaluation["zoom"]["2"].keys() >= {"upscaled_psnr", "upscaled_ssim", "beats_upscaled"}
