@@ -42,6 +42,9 @@ class EvalOptions:
     remedy: str = ""
     """Overrides that are suggested where a render zoomed in loses to the enlarged one; empty: none."""
 
+    advice: str = ""
+    """Overrides that are suggested where a pretrained upscaler is installed and training used none; empty: none."""
+
     def __post_init__(self) -> None:
         if self.ssim not in SSIM_VARIANTS:
             raise ValueError(f"eval.ssim is '{self.ssim}'; choose from {', '.join(SSIM_VARIANTS)}")

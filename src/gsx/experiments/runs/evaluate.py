@@ -57,7 +57,7 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
         evaluation["start"] = doubts
     warn_of_paths(files.evaluation, evaluation)
     write_json(run.folder / "evaluation.json", evaluation)
-    for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy)]:
+    for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy), *advice(run, evaluation, options)]:
         logger.info("%s", line)
     return evaluation
 
@@ -122,6 +122,13 @@ def remedies(run: Run, evaluation: dict[str, Any], remedy: str) -> list[str]:
 def zoom_lines(factor: str, result: dict[str, Any], upscaler: str) -> list[str]:
     """Return the result at one zoom in lines."""
     return [zoom_line(factor, result, upscaler), *consistency_lines(factor, result, upscaler)]
+
+
+def advice(run: Run, evaluation: dict[str, Any], options: EvalOptions) -> list[str]:
+    """Return what else to try: photos enlarged by an installed pretrained upscaler, if training used no augmenter."""
+    if not options.advice or run.augmenters or "networks" not in part(evaluation, "competitor"):
+        return []
+    return [f"a pretrained upscaler is installed: {options.advice} trains on photos that it enlarges, for more detail"]
 
 
 def zoom_line(factor: str, result: dict[str, Any], upscaler: str = "an upscaler") -> str:
