@@ -44,6 +44,8 @@ FIGURES = {
     "upscaled_st_lpips4": (".3f", ("zoom", "4", "perceptual", "st_lpips_alex", "upscaled")),
     "agree4": (".2f", ("zoom", "4", "consistency", "render")),
     "upscaled_agree4": (".2f", ("zoom", "4", "consistency", "upscaled")),
+    "along4": (".3f", ("zoom", "4", "consistency", "detail", "render")),
+    "upscaled_along4": (".3f", ("zoom", "4", "consistency", "detail", "upscaled")),
     "primitives": (",.0f", ("primitives",)),
     "s": (".0f", ("train_seconds",)),
 }
@@ -56,6 +58,8 @@ HEADINGS = {
     "upscaled_st_lpips4": "its ST-LPIPS",
     "agree4": "consistency x4, dB",
     "upscaled_agree4": "that of x1 by SPAN",
+    "along4": "correlation of detail x4",
+    "upscaled_along4": "that of x1 by SPAN",
 }
 RATIOS = ("detail4", "st_lpips4", "s")
 """Figures whose gains are ratios."""
