@@ -422,6 +422,38 @@ def test_figures_of_the_experiment_are_read_from_its_table() -> None:
     assert zoom_truth.figures([line, *more]) == {"zoom": {"x4": "25.500"}}
 
 
+def test_gains_of_a_prior_are_taken_seed_by_seed(tmp_path: Path) -> None:
+    """At x4: 0.5 with seed 0, 0.7 with seed 1; seed 2 has no baseline."""
+    import prior
+
+    given = prior.arguments(["--to", str(tmp_path)])
+
+    def row(name: str, seed: int, x4: float, **more: float) -> dict:
+        return {"scene": "demo", "name": name, "seed": seed, "commit": "abc", "x4": x4, "s": 50.0} | more
+
+    for one in (
+        row("none", 0, 28.0, detail4=0.2),
+        row("none", 1, 28.2, detail4=0.2),
+        row("photos, span", 0, 28.5, detail4=0.3, upscaled4=28.0),
+        row("photos, span", 1, 28.9, detail4=0.34, upscaled4=28.5),
+        row("photos, span", 2, 30.0, detail4=0.5, upscaled4=29.0),
+    ):
+        prior.keep(one, given, {"cpu": "any"}, (0.0, "command"))
+    (gain,) = read_sections(tmp_path / "prior_cpu.json")["gains"]["rows"]
+    assert (gain["seeds"], gain["x4"], gain["detail4"]) == (2, "+0.60 ± 0.10", "1.60 ± 0.10")
+    assert (gain["over_upscaled"], gain["s"], gain["x1"]) == ("+0.45 ± 0.05", "1.00 ± 0.00", "")
+
+
+def test_figures_of_a_prior_are_read_from_its_evaluation(tmp_path: Path) -> None:
+    import prior
+
+    content = {"psnr": 30.0, "zoom": {"4": {"psnr": 28.0, "consistency": {"render": 25.0}}}, "train_seconds": 50.0}
+    (tmp_path / "evaluation.json").write_text(json.dumps(content))
+    assert prior.figures(tmp_path) == {"x1": 30.0, "x4": 28.0, "agree4": 25.0, "s": 50.0}
+    given = prior.arguments(["--rows", "none; none, more steps"])
+    assert list(prior.rows_of(given)) == ["none", "none, more steps"]
+
+
 def test_bad_photographs_are_counted_over_seeds() -> None:
     import captures
 

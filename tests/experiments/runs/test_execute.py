@@ -18,7 +18,7 @@ from gsx.core.errors import CheckpointError, ConfigError, InputError, LostModel
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run
 from gsx.experiments.run_folder import checkpoint
-from gsx.experiments.runs.evaluate import remedies
+from gsx.experiments.runs.evaluate import advice, remedies
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
 from gsx.formats.splat_files import read_gaussians
@@ -99,6 +99,19 @@ def test_a_model_that_loses_zoomed_in_ends_with_what_to_try(finished: Path) -> N
     assert told(x1=None, x2=True, x4=True) == told(**{"x0.5": False}) == told("", x4=False) == []
     run.raster = replace(run.raster, compensate=True)
     assert told(x4=False) == []
+
+
+def test_a_plain_run_is_advised_where_a_pretrained_upscaler_is_installed(finished: Path) -> None:
+    run, settings = open_run(finished, plugins())
+    installed = {"competitor": {"name": "span", "networks": {"x2": {}}}}
+    assert settings.evaluation.advice == "preset=zoom_prior"
+    (line,) = advice(run, installed, settings.evaluation)
+    assert "preset=zoom_prior" in line
+    assert advice(run, {"competitor": {"name": "lanczos"}}, settings.evaluation) == []
+    assert advice(run, {}, settings.evaluation) == []
+    assert advice(run, installed, replace(settings.evaluation, advice="")) == []
+    run.augmenters["upscale"] = None  # type: ignore[assignment]
+    assert advice(run, installed, settings.evaluation) == []
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(finished: Path, tmp_path: Path) -> None:
