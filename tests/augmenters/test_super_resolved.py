@@ -67,6 +67,16 @@ def test_one_render_serves_both_losses(tmp_path: Path, monkeypatch: pytest.Monke
         torch.testing.assert_close(found[name], gradient, rtol=1e-3, atol=1e-7, msg=name)
 
 
+def test_large_pictures_are_announced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Six photos of 48 x 36 px at x2 are 3 * 6 * 48 * 36 * 4 bytes."""
+    monkeypatch.setattr("gsx.augmenters.pseudo_details.LARGE", 1e-4)
+    run = run_at(tmp_path / "run", 44, *TOGETHER)
+    assert augmenter_of(run).gigabytes() == pytest.approx(124416e-9)
+    assert "keeps 0.0 GB of pictures in memory: a larger scene.downscale" in caplog.text
+
+
 def test_one_event_covers_the_run(tmp_path: Path) -> None:
     plan = augmenter_of(run_at(tmp_path / "run", 44, *TOGETHER)).plan()
     assert plan["events"] == [1]

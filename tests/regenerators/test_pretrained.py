@@ -239,7 +239,10 @@ def test_windows_are_cut_from_whole_enlarged_photos():
     store = PhotoStore(1.0, repeated, lambda: "repeated")
     store.expect([whole.view])
     assert store.has(part)
+    assert torch.equal(store.cut(whole), as_blocks(image, 2))
+    assert store.enlarged == {}  # a whole photo is requested once
     assert torch.equal(store.cut(part), as_blocks(window.cut(image), 2))
+    assert list(store.enlarged) == [(0, 2)]
 
 
 def test_enlarged_photos_are_cached_by_content():

@@ -5,6 +5,7 @@ there, and compare the model with the result for a while.
 """
 
 import logging
+import math
 from collections import defaultdict
 from collections.abc import Set
 from dataclasses import replace
@@ -27,6 +28,8 @@ logger = logging.getLogger(__name__)
 
 LEAST_WINDOW = 4
 """Least side of a window, px."""
+LARGE = 2.0
+"""Size of an event's pictures above which a warning names remedies, 1e9 bytes."""
 
 
 class PseudoDetails(Redrawing):
@@ -77,6 +80,18 @@ class PseudoDetails(Redrawing):
         self.regenerator.refuse(self.context.scene.train, options.scales, options.variants > 0)
         if not self.events:
             logger.warning("augmenter %s has no event in a run of %d steps", name, self.context.iterations)
+        if options.window == "whole" and (gigabytes := self.gigabytes()) > LARGE:
+            logger.warning(
+                "augmenter %s keeps %.1f GB of pictures in memory: a larger scene.downscale or "
+                "augmenter.%s.window=random augmenter.%s.timing.every=500 augmenter.%s.timing.span=500 needs less",
+                *(name, gigabytes, name, name, name),
+            )
+
+    def gigabytes(self) -> float:
+        """Returns the size of the pseudo views of an event that makes them for all training views, 1e9 bytes."""
+        cameras = [view.camera for view in self.context.scene.train]
+        pixels = sum(math.prod(self.options.window_size(camera, 1)) for camera in cameras)
+        return 3e-9 * pixels * sum(scale**2 for scale in self.options.scales)
 
     def begins(self) -> int:
         """Returns the first event."""

@@ -44,10 +44,11 @@ class PhotoStore:
 
     def cut(self, request: Request) -> Float[Tensor, "3 H W"]:
         """Returns the requested window of the enlarged photo."""
-        key = request.number, request.scale
-        if key not in self.enlarged:
-            self.enlarged[key] = self.made(request)
-        return enlarged_window(request).cut(self.enlarged[key]).float() / 255
+        key, window = (request.number, request.scale), enlarged_window(request)
+        picture = self.enlarged[key] if key in self.enlarged else self.made(request)
+        if tuple(picture.shape[1:]) != (window.height, window.width):  # a whole photo is requested once
+            self.enlarged[key] = picture
+        return window.cut(picture).float() / 255
 
     def made(self, request: Request) -> UInt8[Tensor, "3 H W"]:
         """Reads the enlarged photo of a request from the cache, or makes it."""
