@@ -6,6 +6,8 @@ import math
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +18,10 @@ from gsx.builtin import plugins
 from gsx.core.data.reduction import Reduction, as_blocks, box_average
 from gsx.core.data.resize import resize, to_uint8
 from gsx.core.data.window import Window
-from gsx.core.errors import ConfigError, InputError
+from gsx.core.errors import ConfigError, InputError, Stopped
 from gsx.experiments.runs.compose import compose
 from gsx.regenerators.pretrained import process
+from gsx.regenerators.pretrained.model_files import Model
 from gsx.regenerators.pretrained.options import ModelOptions, PretrainedOptions
 from gsx.regenerators.pretrained.photo_store import PhotoStore
 from gsx.regenerators.pretrained.process import NetworkProcess
@@ -174,6 +177,81 @@ def test_a_library_that_ends_its_process_ends_with_a_sentence(monkeypatch: pytes
         NetworkProcess(vulkan=False).run(Path("a.param"), np.zeros((3, 64, 64), np.float32))
 
 
+def test_a_reply_that_breaks_off_ends_with_a_sentence(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(process, "PROGRAM", "import os; os.write(1, b'{\"shape\": [3, 8, 8]}\\n...'); os._exit(4)")
+    with pytest.raises(InputError, match=r"exit code 4"):
+        NetworkProcess(vulkan=False).run(Path("a.param"), np.zeros((3, 64, 64), np.float32))
+
+
+ECHO = """import sys
+from gsx.regenerators.pretrained.worker import receive, send
+while message := receive(sys.stdin.buffer):
+    send(sys.stdout.buffer, {}, message[1])
+"""
+
+
+def test_the_reply_to_an_interrupted_picture_is_not_taken_for_the_next_one(monkeypatch: pytest.MonkeyPatch):
+    """A user interrupts training in a notebook, and trains on."""
+
+    def interrupted(stream: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(process, "PROGRAM", ECHO)
+    owner, first, second = NetworkProcess(vulkan=False), np.zeros((3, 2, 2), np.float32), np.ones((3, 2, 2), np.float32)
+    with monkeypatch.context() as patch:
+        patch.setattr(process, "receive", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            owner.run(Path("a.param"), first)
+    np.testing.assert_array_equal(owner.run(Path("a.param"), second), second)
+
+
+def test_a_process_within_a_picture_is_ended_after_a_moment(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(process, "PROGRAM", "import time; time.sleep(600)")
+    monkeypatch.setattr(process, "PATIENCE", 0.05)
+    assert process.end(NetworkProcess(vulkan=False).start()) != 0
+
+
+class Doubling:
+    """A process whose network doubles pictures, and drops the last row of odd ones."""
+
+    def run(self, file: Path, part: np.ndarray) -> np.ndarray:
+        return part[:, : part.shape[1] // 2 * 2].repeat(2, 1).repeat(2, 2)
+
+
+def doubling() -> Pretrained:
+    """Returns a component with such a process, without files."""
+    made = Pretrained(options())
+    made.located = {2: Model(scale=2, file=Path("a.param"), sha256="")}
+    made.process = Doubling()  # type: ignore[assignment]
+    return made
+
+
+def test_a_network_for_even_sides_alone_is_refused_with_a_sentence():
+    assert doubling().enlarge(bars(0, 16), 2, Reduction()).shape == (3, 32, 32)
+    with pytest.raises(InputError, match=r"a\.param makes \(3, 44, 48\) of \(3, 23, 24\).*pictures of any size"):
+        doubling().enlarge(bars(0, 16)[:, :15], 2, Reduction())
+
+
+def test_a_stopping_run_ends_within_its_photos(tmp_path: Path):
+    def stop() -> None:
+        raise Stopped("the run is stopping")
+
+    made = doubling()
+    made.options = replace(made.options, photos_gb=0.0)
+    context: Any = SimpleNamespace(views=[], folder=tmp_path, raise_if_stopping=stop)
+    made.prepare(context)
+    with pytest.raises(Stopped):
+        made.regenerate([request(bars(0), 2)])
+
+
+def test_photos_enlarged_on_a_gpu_are_cached_apart():
+    made = Pretrained(options())
+    made.located = {}
+    by_cpu = made.recipe()
+    made.options = replace(made.options, vulkan=True)
+    assert made.recipe() != by_cpu
+
+
 def test_the_process_ends_with_its_owner(monkeypatch: pytest.MonkeyPatch):
     owner = NetworkProcess(vulkan=False)
     started = owner.start()
@@ -191,7 +269,9 @@ def test_files_are_checked_by_digest(tmp_path: Path):
     known = replace(options(), x2=ModelOptions(file=str(file), sha256=digest))
     assert Pretrained(known).models[2].sha256 == digest
     file.with_suffix(".bin").write_bytes(b"\1")
-    with pytest.raises(ConfigError, match=rf"not {digest}: it is damaged or another version.*x2\.sha256="):
+    with pytest.raises(
+        ConfigError, match=rf"not {digest}: it is damaged or another version.*regenerator\.ROLE\.x2\.sha256="
+    ):
         Pretrained(known).check([], [2], moved=False)
 
 

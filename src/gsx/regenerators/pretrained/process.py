@@ -6,14 +6,17 @@ import sys
 import weakref
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from gsx.core.errors import InputError
 from gsx.regenerators.pretrained.tiles import Picture
-from gsx.regenerators.pretrained.worker import receive, send
+from gsx.regenerators.pretrained.worker import Message, receive, send
 
 PROGRAM = "from gsx.regenerators.pretrained.worker import serve; serve()"
+PATIENCE = 1.0
+"""Time for a process to end by itself, s."""
 
 
 class NetworkProcess:
@@ -29,18 +32,26 @@ class NetworkProcess:
         Raises:
             InputError: the file is no network, or its library fails or ends the process.
         """
-        process = self.process or self.start()
         request = {"file": str(file), "threads": torch.get_num_threads(), "vulkan": self.vulkan}
-        reply = None
-        with suppress(BrokenPipeError):
-            send(process.stdin, request, image)  # type: ignore[arg-type]
-            reply = receive(process.stdout)  # type: ignore[arg-type]
+        reply = self.exchange(self.process or self.start(), request, image)
         if reply is None:
             raise InputError(self.obituary(file))
         fields, result = reply
         if "error" in fields:
             raise InputError(f"{file}: {fields['error']}. Give another network.")
         return result
+
+    def exchange(self, process: subprocess.Popen[bytes], request: dict[str, Any], image: Picture) -> Message | None:
+        """Sends a request and returns its reply; None: the process has ended."""
+        try:
+            with suppress(BrokenPipeError):
+                send(process.stdin, request, image)  # type: ignore[arg-type]
+                return receive(process.stdout)  # type: ignore[arg-type]
+        except BaseException:  # an interruption: the next reply would be that of this request
+            self.process = None
+            end(process)
+            raise
+        return None
 
     def start(self) -> subprocess.Popen[bytes]:
         """Starts the process; it runs in a session of its own, as Ctrl-C is for this one alone."""
@@ -61,12 +72,19 @@ class NetworkProcess:
         assert self.process is not None
         code = end(self.process)
         self.process = None
-        return f"{file}: the library that runs it ended unexpectedly (exit code {code}). Give another network."
+        return (
+            f"{file}: the library that runs it ended unexpectedly (exit code {code}). Give another network, or a "
+            "smaller tile if memory is short."
+        )
 
 
 def end(process: subprocess.Popen[bytes]) -> int:
-    """Closes the input of a process, which ends it, and returns its exit code."""
+    """Closes the input of a process, which ends it between two pictures, and returns its exit code."""
     with suppress(OSError):
         process.stdin.close()  # type: ignore[union-attr]
     process.stdout.close()  # type: ignore[union-attr]
-    return process.wait()
+    try:
+        return process.wait(PATIENCE)
+    except subprocess.TimeoutExpired:  # within a picture, which may take minutes
+        process.kill()
+        return process.wait()

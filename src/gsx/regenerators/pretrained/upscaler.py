@@ -3,7 +3,7 @@
 import itertools
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from importlib.metadata import version
 from typing import Any
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.scene import View
-from gsx.core.errors import ConfigError
+from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import replace_file
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import RegeneratorContext, Request
@@ -21,7 +21,7 @@ from gsx.regenerators.pretrained.model_files import RUNNERS, Model, locate_model
 from gsx.regenerators.pretrained.options import PretrainedOptions
 from gsx.regenerators.pretrained.photo_store import PhotoStore
 from gsx.regenerators.pretrained.process import NetworkProcess
-from gsx.regenerators.pretrained.tiles import run_in_tiles
+from gsx.regenerators.pretrained.tiles import Picture, run_in_tiles
 
 MOST_PASSES = 4
 """Most networks that are applied one after the other."""
@@ -37,12 +37,14 @@ class Pretrained:
         self.process = NetworkProcess(options.vulkan)
         self.photos = PhotoStore(options.photos_gb, self.enlarge, self.recipe)
         self.located: dict[int, Model] | None = None
+        self.raise_if_stopping: Callable[[], None] = lambda: None
+        """Raises `Stopped` if the training run is stopping: a photo takes minutes by a large network."""
 
     @property
     def models(self) -> dict[int, Model]:
         """Networks by scale, located once; errors as `locate_models`."""
         if self.located is None:
-            self.located = locate_models(self.options, f"regenerator {self.options.name}: ROLE")
+            self.located = locate_models(self.options, "regenerator.ROLE")
         return self.located
 
     def check(self, views: Sequence[View], scales: Sequence[int], moved: bool) -> None:
@@ -68,6 +70,7 @@ class Pretrained:
     def prepare(self, context: RegeneratorContext) -> dict[str, float]:
         """Writes the origin of the networks to the run folder, and reserves memory for enlarged photos."""
         self.photos.expect(context.views)
+        self.raise_if_stopping = context.raise_if_stopping
         path = context.folder / f"{self.options.name}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, json.dumps(self.provenance(), indent=2).encode())
@@ -103,15 +106,31 @@ class Pretrained:
 
     def run(self, model: Model, image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 H W"]:
         """Runs one network on a picture."""
-        network = partial(self.process.run, model.file)
-        picture = image.numpy().astype("float32")
+        network, picture = partial(self.run_part, model), image.numpy().astype("float32")
         return torch.from_numpy(run_in_tiles(network, picture, model.scale, self.options.tile, self.options.border))
+
+    def run_part(self, model: Model, part: Picture) -> Picture:
+        """Runs a network on a part of a picture, unless the training run is stopping.
+
+        Raises:
+            InputError: the result has another size, as that of a network for even sides may have.
+        """
+        self.raise_if_stopping()
+        result = self.process.run(model.file, part)
+        expected = (3, *(model.scale * side for side in part.shape[1:]))
+        if result.shape != expected:
+            raise InputError(
+                f"{model.file} makes {result.shape} of {part.shape}, not {expected}: give a network for pictures of "
+                "any size"
+            )
+        return result
 
     def recipe(self) -> object:
         """Returns all that decides the pixels of an enlarged picture, but the picture."""
         networks = {scale: model.sha256 for scale, model in self.models.items()}
         runners = sorted({RUNNERS[model.file.suffix][0] for model in self.models.values()})
-        return networks, self.options.tile, self.options.border, [(name, version(name)) for name in runners]
+        recipe = networks, self.options.tile, self.options.border, [(name, version(name)) for name in runners]
+        return (*recipe, "vulkan") if self.options.vulkan else recipe
 
 
 def factors_of(scale: int, available: Iterable[int], name: str) -> tuple[int, ...]:

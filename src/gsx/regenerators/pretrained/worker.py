@@ -8,11 +8,14 @@ import json
 import os
 import sys
 from functools import lru_cache
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol, TypeAlias
 
 import numpy as np
 
 from gsx.regenerators.pretrained.tiles import Network, Picture
+
+Message: TypeAlias = tuple[dict[str, Any], Picture]
+"""(fields, picture)"""
 
 
 class Runner(Protocol):
@@ -84,15 +87,16 @@ def send(stream: BinaryIO, fields: dict[str, Any], image: Picture | None = None)
     stream.flush()
 
 
-def receive(stream: BinaryIO) -> tuple[dict[str, Any], Picture] | None:
-    """Reads a message, without a picture an empty one; None at the end of the stream."""
+def receive(stream: BinaryIO) -> Message | None:
+    """Reads a message, without a picture an empty one; None at the end of the stream, also within a message."""
     line = stream.readline()
-    if not line:
+    if not line.endswith(b"\n"):
         return None
     fields = json.loads(line)
     shape = fields.get("shape", [0])
-    content = stream.read(4 * int(np.prod(shape)))
-    return fields, np.frombuffer(content, np.float32).reshape(shape)
+    size = 4 * int(np.prod(shape))
+    content = stream.read(size)
+    return (fields, np.frombuffer(content, np.float32).reshape(shape)) if len(content) == size else None
 
 
 def serve() -> None:
