@@ -137,6 +137,23 @@ def test_a_missing_package_leaves_the_figures_out_and_logs_the_remedy(
     assert "competitor" not in evaluation_of(run, None)
 
 
+def test_an_upscaler_that_cannot_learn_leaves_the_figures_out(run: Run, caplog: pytest.LogCaptureFixture) -> None:
+    @dataclass
+    class Poor(Guess):
+        def prepare(self, context: RegeneratorContext) -> dict[str, float]:
+            raise RuntimeError("out of memory")
+
+    with caplog.at_level(logging.INFO):
+        assert competitor_for(run, "guess", Poor, [2.0]) is None
+    assert "no upscaled x1 render to compare with at x2: out of memory" in caplog.text
+
+
+def test_a_run_that_was_stopped_in_its_last_step_is_evaluated(run: Run) -> None:
+    guess, run.progress.stopping = Guess(), True
+    competitor_for(run, "guess", lambda: guess, ZOOMS)
+    guess.contexts[0].raise_if_stopping()
+
+
 def test_without_a_zoom_nothing_is_built(run: Run) -> None:
     def unused() -> Guess:
         raise AssertionError
@@ -149,6 +166,7 @@ def test_without_a_zoom_nothing_is_built(run: Run) -> None:
     [
         (lambda request: request.image, "did not return one picture of shape"),
         (lambda request: larger(request) * float("nan"), "values that are not finite"),
+        (lambda request: {}["tile"], "'tile'"),
     ],
 )
 def test_a_failure_leaves_out_the_zoom_for_all_views(

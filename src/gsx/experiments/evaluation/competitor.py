@@ -23,6 +23,8 @@ Measured: TypeAlias = Callable[[Float[Tensor, "3 H W"]], Float[Tensor, "3 H W"]]
 """Conversion of a picture to what metrics get."""
 REFUSALS = (ConfigError, InputError)
 """Errors by which a regenerator refuses a request."""
+FAILURES = (*REFUSALS, TrainingError, RuntimeError, MemoryError)
+"""Errors of a regenerator that is built or learns."""
 
 
 class Competitor:
@@ -37,7 +39,7 @@ class Competitor:
             return None
         try:
             return self.result(request_of(self.run, image, view, int(factor)))
-        except (*REFUSALS, TrainingError, RuntimeError, MemoryError) as error:
+        except Exception as error:  # of any library or function: the model's own figures are kept
             message = "eval.competitor: %s fails at x%g, where its figures are left out (%s)"
             logger.warning(message, self.name, factor, first_line(error))
             self.scales.discard(int(factor))
@@ -104,7 +106,7 @@ def competitor_for(run: Run, name: str, make: Callable[[], Regenerator], zooms: 
         reached = list(reached_scales(run, regenerator, scales))
         if reached:
             regenerator.prepare(context_of(run, name))
-    except REFUSALS as error:
+    except FAILURES as error:
         log_absent(scales, str(error))
         return None
     return Competitor(run, name, regenerator, reached) if reached else None
@@ -136,7 +138,10 @@ def views_with_truth(run: Run, scale: int) -> list[View]:
 
 
 def context_of(run: Run, name: str) -> RegeneratorContext:
-    """Returns what a regenerator may learn from: the training views alone."""
+    """Returns what a regenerator may learn from: the training views alone.
+
+    It does not end with training: a run that is complete is evaluated, also after a signal in its last step.
+    """
 
     def held_out(share: float) -> list[Float[Tensor, "3 h w"]]:
         raise ConfigError(
@@ -153,5 +158,4 @@ def context_of(run: Run, name: str) -> RegeneratorContext:
         seed=0,
         device=run.device,
         folder=run.folder / "regenerators" / "competitor",
-        raise_if_stopping=run.raise_if_stopping,
     )
