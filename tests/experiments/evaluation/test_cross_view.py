@@ -184,6 +184,16 @@ def test_detail_of_the_world_is_correlated_and_that_of_each_picture_is_not() -> 
     assert abs(consistency(*alone)["detail"]["render"]) < 0.03
 
 
+def test_the_border_of_a_mask_is_no_detail() -> None:
+    plain, masked = plane(camera_at(-0.3)), replace(plane(camera_at(0.3)), masked=True)
+    whole = consistency(plain, replace(masked, masked=False))
+    assert consistency(plain, masked) == {name: value for name, value in whole.items() if name != "detail"}
+    both = Consistency()
+    both.add(plain, masked)
+    both.add(plain, replace(masked, masked=False))
+    assert both.figures()["detail"] == whole["detail"]
+
+
 def windows(camera: Camera, moved: Camera, world: Tensor) -> list[tuple[Camera, Tensor]]:
     """Both cameras with their windows of a picture of the plane."""
     return [(camera, world[..., :-4]), (moved, world[..., 4:])]

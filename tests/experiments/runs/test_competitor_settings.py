@@ -74,6 +74,7 @@ def test_evaluations_from_before_it_stay_valid(composed: dict[str, Settings]) ->
     before = json.loads(json.dumps(now))
     del before["eval"]["competitor"], before["eval"]["pairs"]
     assert evaluated_alike(before, now)
+    assert evaluated_alike(before | {"metrics": {"lpips": before["metrics"]["lpips"]}}, now)
     assert evaluated_alike(now, now)
     assert not evaluated_alike(now, other)
     assert not evaluated_alike(now, evaluation_settings(composed["eval.competitor=null"].resolved))
@@ -129,6 +130,10 @@ def test_the_log_says_win_or_loss_against_both() -> None:
         "(29.55 dB); detail +0.200 (x1 enlarged: -0.010, by span: +0.050, photo: +0.100)",
         "zoom x4: neighbouring views agree to 33.00 dB, detail 0.75 (x1 enlarged: 35.50 dB, detail 0.80; "
         "photos: 30.25 dB, detail 0.50)",
+    ]
+    masked = {"consistency": {"render": 33.0, "enlarged": 35.5, "truth": 30.25, "pixels": 0.5}}
+    assert zoom_lines("4", entry | masked, "span")[1:] == [
+        "zoom x4: neighbouring views agree to 33.00 dB (x1 enlarged: 35.50 dB; photos: 30.25 dB)"
     ]
     bare = {"psnr": 29.4, "enlarged_psnr": 28.7, "beats_enlarged": True}
     assert zoom_lines("4", bare, "span") == ["zoom x4: 29.40 dB, wins against the enlarged x1 render (28.70 dB)"]

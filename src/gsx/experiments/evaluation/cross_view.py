@@ -38,6 +38,8 @@ class SurfaceView:
     """Pictures by name (COMPARED), as bytes where they are quantised."""
     size: tuple[int, int]
     """(height, width) at the training resolution, px."""
+    masked: bool = False
+    """True: pictures are black where a mask is, and its border would be detail."""
 
     def picture(self, name: str) -> Float[Tensor, "3 H W"]:
         """Returns a picture."""
@@ -57,16 +59,19 @@ class Sums:
     powers: tuple[float, float] = (0.0, 0.0)
     """Squares of the detail, of the warped picture and of the other."""
 
-    def add(
-        self, source: Float[Tensor, "3 H W"], target: Float[Tensor, "3 H W"], match: "Match", size: tuple[int, int]
-    ) -> None:
-        """Warps a picture and compares it with another, as they are and by their detail."""
+    def add(self, source: Float[Tensor, "3 H W"], target: Float[Tensor, "3 H W"], match: "Match") -> None:
+        """Warps a picture and compares it with another."""
         one, other = match.colours(source, target)
         self.squares += float((one - other).square().sum())
+        self.pixels += len(match.indices)
+
+    def add_detail(
+        self, source: Float[Tensor, "3 H W"], target: Float[Tensor, "3 H W"], match: "Match", size: tuple[int, int]
+    ) -> None:
+        """Warps the detail of a picture and compares it with that of another."""
         one, other = match.colours(detail_layer(source, size), detail_layer(target, size))
         self.products += float((one * other).sum())
         self.powers = self.powers[0] + float(one.square().sum()), self.powers[1] + float(other.square().sum())
-        self.pixels += len(match.indices)
 
     @property
     def psnr(self) -> float:
@@ -117,26 +122,34 @@ class Consistency:
     """Compared pixels."""
     total: int = 0
     """Pixels of the pictures that others are warped into."""
+    detailed: bool = False
+    """True: the detail of a pair was compared."""
 
     def add(self, source: SurfaceView, target: SurfaceView) -> None:
         """Warps the source's pictures into the target and compares them with its own."""
         indices, places = places_in(source.surface, target.surface)
-        match = Match(indices=indices, places=places)
+        match, detailed = Match(indices=indices, places=places), not (source.masked or target.masked)
         for name in target.stored.keys() & source.stored.keys():
-            sums = self.sums.setdefault(name, Sums())
-            sums.add(source.picture(name), target.picture(name), match, target.size)
+            sums, pictures = self.sums.setdefault(name, Sums()), (source.picture(name), target.picture(name))
+            sums.add(*pictures, match)
+            if detailed:
+                sums.add_detail(*pictures, match, target.size)
+        self.detailed |= detailed
         self.pixels += len(indices)
         self.total += target.surface.visible.numel()
 
     def figures(self) -> dict[str, object]:
-        """Returns PSNR in dB and correlation of detail by picture, and the share of compared pixels; empty without."""
+        """Returns PSNR in dB and correlation of detail by picture, and the share of compared pixels; empty without.
+
+        There is no detail if all pairs have a mask.
+        """
         if not self.pixels:
             return {}
         known = {name: self.sums[name] for name in COMPARED if name in self.sums}
         whole = {name: sums for name, sums in known.items() if sums.pixels == self.pixels}
         levels: dict[str, object] = {name: sums.psnr for name, sums in whole.items()}
         detail = {name: sums.correlation for name, sums in whole.items()}
-        return levels | {"pixels": self.pixels / self.total, "detail": detail}
+        return levels | {"pixels": self.pixels / self.total} | ({"detail": detail} if self.detailed else {})
 
 
 class CrossViews:
@@ -193,7 +206,12 @@ class CrossViews:
         pictures: dict[str, Tensor] = zoomed.pictures(COMPARED)
         if self.options.quantise:
             pictures = {name: to_uint8(picture) for name, picture in pictures.items()}
-        return SurfaceView(surface=surface, stored=pictures, size=(view.camera.height, view.camera.width))
+        return SurfaceView(
+            surface=surface,
+            stored=pictures,
+            size=(view.camera.height, view.camera.width),
+            masked=zoomed.view.counted() is not None,
+        )
 
     def figures(self, factor: float) -> dict[str, dict[str, object]]:
         """Returns the entry `consistency` of a zoom; empty where nothing was compared."""

@@ -159,9 +159,13 @@ def finished(run: RunFiles, config: dict[str, Any], stamp: str, idle: Collection
 
 
 def evaluated_alike(saved: dict[str, Any], now: dict[str, Any]) -> bool:
-    """Return True if an evaluation was made by the settings of now; keys of `eval` that are newer do not count."""
-    known = {key: value for key, value in part(now, "eval").items() if key in part(saved, "eval")}
-    return saved == now | ({"eval": known} if known else {})
+    """Return True if an evaluation was made by the settings of now; keys of EVALUATION that are newer do not count."""
+    return saved == now | {group: in_both(part(now, group), part(saved, group)) for group in EVALUATION}
+
+
+def in_both(now: dict[str, Any], saved: dict[str, Any]) -> dict[str, Any]:
+    """Select the values of now whose keys are saved."""
+    return {key: value for key, value in now.items() if key in saved}
 
 
 def comparable(config: dict[str, Any]) -> dict[str, Any]:

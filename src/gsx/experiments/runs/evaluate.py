@@ -172,12 +172,12 @@ def perceptual_texts(result: dict[str, Any], names: dict[str, str]) -> Iterator[
 
 def consistency_lines(factor: str, result: dict[str, Any], upscaler: str) -> list[str]:
     """Return the consistency of neighbouring views at a zoom in words; none if it was not measured."""
-    found = part(result, "consistency")
+    levels, detail = part(result, "consistency"), part(part(result, "consistency"), "detail")
     names = {"render": "", "enlarged": "x1 enlarged: ", "upscaled": f"by {upscaler}: ", "truth": "photos: "}
     texts = [
-        f"{name}{found[kind]:.2f} dB, detail {part(found, 'detail')[kind]:.2f}"
+        f"{name}{levels[kind]:.2f} dB" + (f", detail {detail[kind]:.2f}" if kind in detail else "")
         for kind, name in names.items()
-        if kind in found
+        if kind in levels
     ]
     return [f"zoom x{factor}: neighbouring views agree to {texts[0]} ({'; '.join(texts[1:])})"] if texts else []
 
