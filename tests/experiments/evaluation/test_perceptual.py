@@ -215,6 +215,8 @@ def test_figures_by_picture_and_their_means() -> None:
     assert first == {"d": {"render": 0.25, "enlarged": 0.5}}
     other = {"d": {"render": 0.75, "enlarged": 0.0}}
     assert zoom_means([first, other]) == {"perceptual": {"d": {"render": 0.5, "enlarged": 0.25}}}
+    assert zoom_means([first, {}]) == {"perceptual": first}
+    assert zoom_means([{"d": {**first["d"], "upscaled": 0.125}}, other]) == zoom_means([first, other])
     assert zoom_means([]) == zoom_means([{}]) == {}
     views = [{"perceptual": metrics.view(pictures.render, pictures.truth)}, {"perceptual": {"d": 0.75}}]
     assert metrics.summary(views) == {"perceptual": {"d": 0.5}}

@@ -114,13 +114,16 @@ def at_training_size(view: Mapping[str, float]) -> Figures:
 
 
 def zoom_means(views: Sequence[Figures]) -> dict[str, Figures]:
-    """Returns mean figures over views under the key `perceptual`; empty where nothing was measured."""
-    places = dict.fromkeys((metric, picture) for view in views for metric in view for picture in view[metric])
+    """Returns mean figures over views under the key `perceptual`; empty where nothing was measured.
+
+    Pictures that some of the measured views lack are left out, so that means of a metric are over the same views.
+    """
     means: Figures = {}
-    for metric, picture in places:
-        mean = mean_of([view[metric][picture] for view in views if picture in view.get(metric, {})])
-        if mean is not None:
-            means.setdefault(metric, {})[picture] = mean
+    for metric in dict.fromkeys(metric for view in views for metric in view):
+        measured = [view[metric] for view in views if view.get(metric)]
+        shared = [name for name in COMPARED if measured and all(name in pictures for pictures in measured)]
+        if shared:
+            means[metric] = {name: statistics.fmean(pictures[name] for pictures in measured) for name in shared}
     return {"perceptual": means} if means else {}
 
 
