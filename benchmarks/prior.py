@@ -194,10 +194,7 @@ def line_of(pairs: Sequence[tuple[Row, Row]]) -> Row:
     own = [one for one, _ in pairs]
     return (
         {key: spread([less(a.get(key), b.get(key)) for a, b in pairs], "+.2f") for key in ("x1", "x2", "x4")}
-        | {
-            key: spread([over(a.get(key), b.get(key)) for a, b in pairs], ".2f")
-            for key in ("detail4", "st_lpips4", "s")
-        }
+        | {key: spread([over(a.get(key), b.get(key)) for a, b in pairs], ".2f") for key in RATIOS}
         | {"over_upscaled": spread([less(a.get("x4"), a.get("upscaled4")) for a in own], "+.2f")}
         | {"over_agree": spread([less(a.get("agree4"), a.get("upscaled_agree4")) for a in own], "+.2f")}
     )

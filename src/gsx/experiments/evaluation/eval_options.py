@@ -41,7 +41,6 @@ class EvalOptions:
     """Draw a flight into the finest detail, for the report."""
     remedy: str = ""
     """Overrides that are suggested where a render zoomed in loses to the enlarged one; empty: none."""
-
     advice: str = ""
     """Overrides that are suggested where a pretrained upscaler is installed and training used none; empty: none."""
 
