@@ -67,6 +67,16 @@ def test_one_render_serves_both_losses(tmp_path: Path, monkeypatch: pytest.Monke
         torch.testing.assert_close(found[name], gradient, rtol=1e-3, atol=1e-7, msg=name)
 
 
+def test_a_longer_run_warns_that_it_goes_on_without(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The only event was at step 1, for fewer steps."""
+    augmenter = augmenter_of(run := run_at(tmp_path / "run", 1, *TOGETHER))
+    assert augmenter.term(run, 2, 0) is not None
+    longer = augmenter_of(again := run_at(tmp_path / "again", 44, *TOGETHER, "iterations=90"))
+    again.folder = run.folder
+    assert longer.term(again, 45, 0) is None
+    assert "no later event makes pseudo views" in caplog.text
+
+
 def test_large_pictures_are_announced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -74,7 +84,12 @@ def test_large_pictures_are_announced(
     monkeypatch.setattr("gsx.augmenters.pseudo_details.LARGE", 1e-4)
     run = run_at(tmp_path / "run", 44, *TOGETHER)
     assert augmenter_of(run).gigabytes() == pytest.approx(124416e-9)
-    assert "keeps 0.0 GB of pictures in memory: a larger scene.downscale" in caplog.text
+    (message,) = [one.message for one in caplog.records if "keeps 0.0 GB of pictures in memory" in one.message]
+    remedy = message.partition("windows: ")[2].split()
+    less = augmenter_of(run_at(tmp_path / "less", 44, *TOGETHER, *remedy))
+    assert less.gigabytes() == pytest.approx(124416e-9 / 4)
+    assert less.plan()["events"] == list(range(1, 80))
+    assert less.plan()["span"] == 1
 
 
 def test_one_event_covers_the_run(tmp_path: Path) -> None:

@@ -30,6 +30,8 @@ LEAST_WINDOW = 4
 """Least side of a window, px."""
 LARGE = 2.0
 """Size of an event's pictures above which a warning names remedies, 1e9 bytes."""
+WINDOWS = ("window=random", "timing.stop=39500", "timing.every=500", "timing.span=500")
+"""Options that replace whole pictures by random windows, which change over the run."""
 
 
 class PseudoDetails(Redrawing):
@@ -82,16 +84,15 @@ class PseudoDetails(Redrawing):
             logger.warning("augmenter %s has no event in a run of %d steps", name, self.context.iterations)
         if options.window == "whole" and (gigabytes := self.gigabytes()) > LARGE:
             logger.warning(
-                "augmenter %s keeps %.1f GB of pictures in memory: a larger scene.downscale or "
-                "augmenter.%s.window=random augmenter.%s.timing.every=500 augmenter.%s.timing.span=500 needs less",
-                *(name, gigabytes, name, name, name),
+                "augmenter %s keeps %.1f GB of pictures in memory; less for a larger scene.downscale, or windows: %s",
+                *(name, gigabytes, " ".join(f"augmenter.{name}.{word}" for word in WINDOWS)),
             )
 
     def gigabytes(self) -> float:
         """Returns the size of the pseudo views of an event that makes them for all training views, 1e9 bytes."""
-        cameras = [view.camera for view in self.context.scene.train]
-        pixels = sum(math.prod(self.options.window_size(camera, 1)) for camera in cameras)
-        return 3e-9 * pixels * sum(scale**2 for scale in self.options.scales)
+        cameras, scales = [view.camera for view in self.context.scene.train], self.options.scales
+        windows = [(scale, self.options.window_size(camera, scale)) for camera in cameras for scale in scales]
+        return 3e-9 * sum(scale**2 * math.prod(size) for scale, size in windows)
 
     def begins(self) -> int:
         """Returns the first event."""

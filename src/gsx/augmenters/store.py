@@ -63,7 +63,7 @@ class Store:
         latest = [path] if path.is_file() else self.files(run)[-1:]
         try:
             if latest and (found := load_views(latest[0]))[1]["iterations"] != self.iterations:
-                logger.info("%s: the run became longer, no pseudo views until the next event", self.name)
+                self.log_longer(event)
                 return []
             return found[0] if latest == [path] else load_views(path)[0]
         except (OSError, ValueError) as error:
@@ -71,6 +71,17 @@ class Store:
                 f"{path} cannot be read ({error}): the run needs the pseudo views of step {event} to continue at step "
                 f"{run.step}; restore the file, or train anew"
             ) from error
+
+    def log_longer(self, event: int) -> None:
+        """Logs that a longer run continues without the pseudo views of an event."""
+        if any(other > event for other in self.events):
+            logger.info("%s: the run became longer, no pseudo views until the next event", self.name)
+        else:
+            logger.warning(
+                "%s: the run became longer, and no later event makes pseudo views for its further steps; to have them, "
+                "train anew",
+                self.name,
+            )
 
 
 def picture_name(augmenter: str, view: PseudoView) -> str:
