@@ -84,7 +84,7 @@ class PseudoDetails(Redrawing):
             logger.warning("augmenter %s has no event in a run of %d steps", name, self.context.iterations)
         if options.window == "whole" and (gigabytes := self.gigabytes()) > LARGE:
             logger.warning(
-                "augmenter %s keeps %.1f GB of pictures in memory; less for a larger scene.downscale, or windows: %s",
+                "augmenter %s keeps %.1f GB of pictures in memory: set a larger scene.downscale, or windows: %s",
                 *(name, gigabytes, " ".join(f"augmenter.{name}.{word}" for word in WINDOWS)),
             )
 
