@@ -89,9 +89,12 @@ def test_networks_are_chained_to_reach_a_scale(scale: int, available: tuple[int,
     assert factors_of(scale, available, "ncnn") == expected
 
 
-@pytest.mark.parametrize(("scale", "available"), [(3, (2, 4)), (2, ()), (64, (2,)), (5, (1, 4))])
-def test_scales_that_no_chain_reaches_are_refused(scale: int, available: tuple[int, ...]):
-    with pytest.raises(ConfigError, match=rf"cannot enlarge x{scale} .*change the augmenter's scales"):
+@pytest.mark.parametrize(("scale", "available", "remedy"), [
+    (3, (2, 4), "choose other scales or another regenerator"), (64, (2,), "choose other scales"),
+    (5, (1, 4), "choose other scales"), (2, (), r"\(none\): give x2\.file"), (8, (1,), r"\(x1\): give x4\.file"),
+])  # fmt: skip
+def test_scales_that_no_chain_reaches_are_refused(scale: int, available: tuple[int, ...], remedy: str):
+    with pytest.raises(ConfigError, match=rf"cannot enlarge x{scale} .*{remedy}"):
         factors_of(scale, available, "ncnn")
 
 
@@ -158,6 +161,41 @@ def test_what_is_no_network_is_refused_before_training(shared: NetworkProcess, t
     file.write_text("7767517\nnone\n")
     with pytest.raises(InputError, match=r"nearest2\.param: .*Give another network"):
         upscaler(shared, x2=file).check([], [2], moved=False)
+
+
+@needs_ncnn
+def test_a_gpu_that_is_absent_is_not_replaced_by_the_cpu(tmp_path: Path):
+    ncnn = pytest.importorskip("ncnn")
+    if ncnn.get_gpu_count():
+        pytest.skip("this machine has a GPU with Vulkan")
+    with pytest.raises(InputError, match=r"no GPU with Vulkan\. Set vulkan=false\.$"):
+        NetworkProcess(vulkan=True).run(nearest_file(tmp_path, 2), np.zeros((3, 8, 8), np.float32))
+
+
+NAN = """7767517
+6 8
+Input in 0 1 data
+Interp up 1 1 data big 0=1 1=2.0 2=2.0
+Split a 1 2 big first second
+BinaryOp minus 2 1 first second zero 0=1
+Split b 1 2 zero third fourth
+BinaryOp by 2 1 third fourth output 0=3
+"""
+"""A network of ncnn that divides zero by zero."""
+
+
+@needs_ncnn
+def test_a_network_without_finite_values_is_refused_before_training(shared: NetworkProcess, tmp_path: Path):
+    file = nearest_file(tmp_path, 2)
+    file.write_text(NAN)
+    with pytest.raises(ConfigError, match=r"nearest2\.param makes values of a grey picture that are not finite"):
+        upscaler(shared, x2=file).check([], [2], moved=False)
+
+
+def test_a_border_wider_than_its_part_is_refused():
+    """Parts of 16 px with a border of 1024 px took 16 GB for each picture."""
+    with pytest.raises(ConfigError, match=r"span: border is 1024 px, tile is 512 px\. Lower border, or raise tile"):
+        compose(["regenerator/upscale=span", "regenerator.upscale.border=1024"], plugins())
 
 
 @needs_ncnn

@@ -41,6 +41,11 @@ class PretrainedOptions:
     vulkan: bool
     """True: run on a GPU by Vulkan."""
 
+    def __post_init__(self) -> None:
+        if self.border > self.tile:
+            sides = f"border is {self.border} px, tile is {self.tile} px"
+            raise ValueError(f"regenerator {self.name}: {sides}. Lower border, or raise tile.")
+
     def models(self) -> dict[int, ModelOptions]:
         """Returns the networks with a file, by scale."""
         by_scale = {scale: getattr(self, f"x{scale}") for scale in SCALES}

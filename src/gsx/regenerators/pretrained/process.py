@@ -38,7 +38,7 @@ class NetworkProcess:
             raise InputError(self.obituary(file))
         fields, result = reply
         if "error" in fields:
-            raise InputError(f"{file}: {fields['error']}. Give another network.")
+            raise InputError(f"{file}: {fields['error']}")
         return result
 
     def exchange(self, process: subprocess.Popen[bytes], request: dict[str, Any], image: Picture) -> Message | None:

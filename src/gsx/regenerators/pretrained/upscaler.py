@@ -8,6 +8,7 @@ from functools import partial
 from importlib.metadata import version
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,7 +19,7 @@ from gsx.core.files import replace_file
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.regenerators.pretrained.model_files import RUNNERS, Model, locate_models
-from gsx.regenerators.pretrained.options import PretrainedOptions
+from gsx.regenerators.pretrained.options import SCALES, PretrainedOptions
 from gsx.regenerators.pretrained.photo_store import PhotoStore
 from gsx.regenerators.pretrained.process import NetworkProcess
 from gsx.regenerators.pretrained.tiles import Picture, run_in_tiles
@@ -62,6 +63,8 @@ class Pretrained:
         shape = tuple(result.shape)
         if len(shape) != 3 or shape[0] != 3 or shape[1] != shape[2] or shape[1] % TRIAL:
             raise ConfigError(f"{model.file} makes {shape} of (3, {TRIAL}, {TRIAL}): give a network for RGB pictures")
+        if not np.isfinite(result).all():
+            raise ConfigError(f"{model.file} makes values of a grey picture that are not finite: give another network")
         if shape[1] != model.scale * TRIAL:
             raise ConfigError(
                 f"{model.file} enlarges x{shape[1] // TRIAL}: give it as x{shape[1] // TRIAL}.file, not x{model.scale}"
@@ -149,7 +152,6 @@ def factors_of(scale: int, available: Iterable[int], name: str) -> tuple[int, ..
     reached = [chain for chain in chains if math.prod(chain) % scale == 0]
     if not reached:
         have = ", ".join(f"x{one}" for one in sorted(scales)) or "none"
-        raise ConfigError(
-            f"regenerator {name} cannot enlarge x{scale} by its networks ({have}): change the augmenter's scales"
-        )
+        remedy = "choose other scales or another regenerator" if larger else f"give x{min(scale, SCALES[-1])}.file"
+        raise ConfigError(f"regenerator {name} cannot enlarge x{scale} by its networks ({have}): {remedy}")
     return min(reached, key=lambda chain: (math.prod(chain), len(chain)))

@@ -7,6 +7,7 @@ network's threads from torch's, which share no OpenMP runtime, and a damaged fil
 import json
 import os
 import sys
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, BinaryIO, Protocol, TypeAlias
 
@@ -18,11 +19,15 @@ Message: TypeAlias = tuple[dict[str, Any], Picture]
 """(fields, picture)"""
 
 
+class Refusal(Exception):
+    """Request that cannot be answered; the message ends with a remedy."""
+
+
 class Runner(Protocol):
     """A function that opens a network for a number of threads, on a GPU by Vulkan or not."""
 
     def __call__(self, file: str, threads: int, vulkan: bool) -> Network:
-        """Returns the network of a file; ValueError: it cannot be read."""
+        """Returns the network of a file; Refusal: it cannot be run."""
         ...
 
 
@@ -30,14 +35,15 @@ def ncnn_network(file: str, threads: int, vulkan: bool) -> Network:
     """Opens a .param file and its .bin file."""
     import ncnn
 
+    if vulkan and not ncnn.get_gpu_count():
+        raise Refusal("ncnn has no GPU with Vulkan. Set vulkan=false.")
     net = ncnn.Net()
     net.opt.num_threads, net.opt.use_vulkan_compute = threads, vulkan
     weights = os.path.splitext(file)[0] + ".bin"
     if net.load_param(file) or net.load_model(weights):
         raise ValueError("ncnn cannot read it")
     names = net.input_names(), net.output_names()
-    if any(len(ends) != 1 for ends in names):
-        raise ValueError(f"it has {len(names[0])} inputs and {len(names[1])} outputs; one of each is needed")
+    refuse_several(*names)
 
     def run(image: Picture) -> Picture:
         extractor = net.create_extractor()
@@ -55,12 +61,19 @@ def onnx_network(file: str, threads: int, vulkan: bool) -> Network:
     import onnxruntime
 
     if vulkan:
-        raise ValueError("ONNX files run on the CPU: set vulkan=false")
+        raise Refusal("ONNX files run on the CPU. Set vulkan=false.")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = threads, 3
     session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
-    (entry,) = session.get_inputs()
-    return lambda image: session.run(None, {entry.name: image[None]})[0][0]
+    inputs = session.get_inputs()
+    refuse_several(inputs, session.get_outputs())
+    return lambda image: session.run(None, {inputs[0].name: image[None]})[0][0]
+
+
+def refuse_several(inputs: Sequence[object], outputs: Sequence[object]) -> None:
+    """Raises ValueError unless a network has one input and one output."""
+    if len(inputs) != 1 or len(outputs) != 1:
+        raise ValueError(f"it has {len(inputs)} inputs and {len(outputs)} outputs; one of each is needed")
 
 
 RUNNERS: dict[str, Runner] = {".param": ncnn_network, ".onnx": onnx_network}
@@ -106,7 +119,9 @@ def serve() -> None:
     while (message := receive(sys.stdin.buffer)) is not None:
         try:
             result = answer(*message)
+        except Refusal as error:
+            send(replies, {"error": f"{error}"})
         except Exception as error:  # of any library
-            send(replies, {"error": f"{error}".partition("\n")[0]})
+            send(replies, {"error": f"{error}".partition("\n")[0] + ". Give another network."})
         else:
             send(replies, {}, result)
