@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from gsx.core.data.camera import Camera
+from gsx.experiments.evaluation.installed_weights import MetricUnavailable
 from gsx.experiments.evaluation.niqe import (
     PATCH,
     Niqe,
@@ -130,3 +131,8 @@ def test_statistics_come_from_the_scenes_photos(caplog: pytest.LogCaptureFixture
     with caplog.at_level(logging.INFO):
         assert not load_metrics(["niqe"], replace(settings, photos=views[:1])).metrics
     assert "sharp patches of 96 px, it needs 37: train on larger photos" in caplog.text
+
+
+def test_photos_smaller_than_a_patch_have_none() -> None:
+    with pytest.raises(MetricUnavailable, match="have 0 sharp patches"):
+        niqe_of([natural(0, 48, 2 * PATCH)])

@@ -87,7 +87,9 @@ def niqe_of(photos: Iterable[Float[Tensor, "3 H W"]]) -> tuple[Niqe, int]:
 
 
 def sharp_features(photo: Float[Tensor, "3 H W"]) -> Float[Tensor, "P F"]:
-    """Describes the sharp patches of a photo."""
+    """Describes the sharp patches of a photo; none of one smaller than a patch."""
+    if min(photo.shape[1:]) < PATCH:
+        return torch.zeros(0, FEATURES, dtype=torch.float64)
     features, sharpness = described(photo)
     return features[sharpness > SHARP * sharpness.max()] if len(features) else features
 

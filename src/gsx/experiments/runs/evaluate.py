@@ -57,7 +57,7 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
         evaluation["start"] = doubts
     warn_of_paths(files.evaluation, evaluation)
     write_json(run.folder / "evaluation.json", evaluation)
-    for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy), *advice(run, evaluation, options)]:
+    for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy), *advice(evaluation, settings)]:
         logger.info("%s", line)
     return evaluation
 
@@ -124,11 +124,12 @@ def zoom_lines(factor: str, result: dict[str, Any], upscaler: str) -> list[str]:
     return [zoom_line(factor, result, upscaler), *consistency_lines(factor, result, upscaler)]
 
 
-def advice(run: Run, evaluation: dict[str, Any], options: EvalOptions) -> list[str]:
+def advice(evaluation: dict[str, Any], settings: Settings) -> list[str]:
     """Return what else to try: photos enlarged by an installed pretrained upscaler, if training used no augmenter."""
-    if not options.advice or run.augmenters or "networks" not in part(evaluation, "competitor"):
+    words = settings.evaluation.advice
+    if not words or settings.augmenters or "networks" not in part(evaluation, "competitor"):
         return []
-    return [f"a pretrained upscaler is installed: {options.advice} trains on photos that it enlarges, for more detail"]
+    return [f"a pretrained upscaler is installed: {words} trains on photos that it enlarges, for more detail"]
 
 
 def zoom_line(factor: str, result: dict[str, Any], upscaler: str = "an upscaler") -> str:
