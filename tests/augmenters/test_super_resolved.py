@@ -1,5 +1,6 @@
 """Enlarged photos as targets from the first step: one render serves both losses."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 from test_pseudo_details import augmenter_of, copied_gradients, run_at
 from torch import Tensor
 
+from gsx.augmenters.redraw import batches
 from gsx.core.data.camera import look_at
 from gsx.core.quality.losses import photometric, ssim_map
 from gsx.core.rasterizer import rasterize
@@ -34,7 +36,9 @@ def test_the_photos_loss_of_a_pseudo_view() -> None:
     assert found == pytest.approx(float(photometric(image, truth, 0.2)), rel=1e-5)
     half = torch.zeros(20, 24, dtype=torch.uint8)
     half[:, :12] = 255
-    by_hand = 0.8 * (image - truth).abs()[..., :12].sum() + 0.2 * (1 - ssim_map(image, truth))[..., :12].sum()
+    counted = (half > 0).float()  # what does not count is black in both, as in the loss of photos
+    unlike = 1 - ssim_map(image * counted, truth * counted)
+    by_hand = 0.8 * (image - truth).abs()[..., :12].sum() + 0.2 * unlike[..., :12].sum()
     found = float(pseudo_loss(image, pseudo_view(target, half), ssim_weight=0.2))
     assert found == pytest.approx(float(by_hand) / image.numel(), rel=1e-5)
 
@@ -67,14 +71,47 @@ def test_one_render_serves_both_losses(tmp_path: Path, monkeypatch: pytest.Monke
         torch.testing.assert_close(found[name], gradient, rtol=1e-3, atol=1e-7, msg=name)
 
 
-def test_a_longer_run_warns_that_it_goes_on_without(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_longer_run_goes_on_with_its_pictures(tmp_path: Path) -> None:
     """The only event was at step 1, for fewer steps."""
     augmenter = augmenter_of(run := run_at(tmp_path / "run", 1, *TOGETHER))
     assert augmenter.term(run, 2, 0) is not None
     longer = augmenter_of(again := run_at(tmp_path / "again", 44, *TOGETHER, "iterations=90"))
     again.folder = run.folder
-    assert longer.term(again, 45, 0) is None
-    assert "no later event makes pseudo views" in caplog.text
+    term = longer.term(again, 45, 0)
+    assert term is not None
+    assert torch.equal(term.parts[0][0].target, augmenter.views[0][0].target)
+
+
+def test_pictures_of_photos_follow_their_corrected_pose(tmp_path: Path) -> None:
+    run = run_at(tmp_path / "run", 1, *TOGETHER)
+    augmenter = augmenter_of(run)
+    (first, _), *_ = augmenter.term(run, 2, 0).parts
+    assert first.camera.draws_as(run.scene.train[0].camera.zoom(2))
+    moved = replace(run.scene.train[0].camera, translation=run.scene.train[0].camera.translation + 0.1)
+    views = [replace(run.scene.train[0], camera=moved), *run.scene.train[1:]]
+    run.views = replace(run.views, scene=replace(run.scene, train=views))
+    (later, _), *_ = augmenter.term(run, 3, 0).parts
+    assert later.camera.draws_as(moved.zoom(2))
+
+
+def test_masked_pixels_do_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = run_at(tmp_path / "run", 1, *TOGETHER)
+    counted = torch.ones(36, 48, dtype=torch.bool)
+    counted[3:9, 5:17] = False
+    monkeypatch.setattr(type(run.scene.train[0]), "counted", lambda view: counted)
+    (view, _), *_ = augmenter_of(run).term(run, 2, 0).parts
+    assert torch.equal(view.pixel_weight > 0, counted.repeat_interleave(2, 0).repeat_interleave(2, 1))
+
+
+def test_batches_are_bounded_by_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six pictures of 96 x 72 px: two of them are 13,824 px."""
+    run = run_at(tmp_path / "run", 1, *TOGETHER)
+    specs = list(augmenter_of(run).planner.specs(run, 1, set(range(6))))
+    assert [len(batch) for batch in batches(specs)] == [6]
+    monkeypatch.setattr("gsx.augmenters.redraw.BATCH_PIXELS", 13_824)
+    assert [len(batch) for batch in batches(specs)] == [2, 2, 2]
+    monkeypatch.setattr("gsx.augmenters.redraw.BATCH_PIXELS", 1)
+    assert [one for batch in batches(specs) for one in batch] == specs
 
 
 def test_large_pictures_are_announced(

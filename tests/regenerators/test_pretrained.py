@@ -377,8 +377,10 @@ def test_enlarged_photos_are_cached_by_content():
 
 
 def test_renders_and_photos_that_do_not_fit_are_enlarged_by_themselves():
-    one = request(bars(6), 2)
+    whole = request(bars(6), 2)
+    one = replace(whole, image=whole.image[:, :20], camera=Window(0, 0, 48, 20).of(whole.camera))
     store = PhotoStore(1e-5, repeated, lambda: "")
+    assert store.has(whole)  # is not kept in memory
     assert not store.has(one)  # unknown photos
     store.expect([one.view])
     assert not store.has(one)

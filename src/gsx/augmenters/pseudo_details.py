@@ -142,7 +142,7 @@ class PseudoDetails(Redrawing):
         sizes = areas if options.per_pixel else [1.0] * len(views)
         return Term(
             name=self.context.name,
-            parts=[(pseudo, each / count * size) for pseudo, size in zip(views, sizes, strict=True)],
+            parts=[(at_current_pose(run, one), each / count * size) for one, size in zip(views, sizes, strict=True)],
             replaces=0.0 if direct else share * len(views) / pictures,
             observed=options.densify,
             shared=not frozen,
@@ -204,3 +204,11 @@ class PseudoDetails(Redrawing):
             facts["masked"] = 1 - (sum(weights) + len(views) - len(weights)) / len(views)
             logger.info("%s: %.1f%% of the pixels do not count", self.context.name, 100 * facts["masked"])
         return views, facts
+
+
+def at_current_pose(run: Run, view: PseudoView) -> PseudoView:
+    """Returns a pseudo view; if it shows a photo, at the pose that the photo has now."""
+    camera = run.train_views[view.parent].camera
+    if view.provenance.get("source") != "photo" or view.camera.has_pose_of(camera):
+        return view
+    return replace(view, camera=view.camera.with_pose_of(camera))

@@ -2,7 +2,8 @@
 
 import hashlib
 import logging
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -34,8 +35,8 @@ from gsx.core.training.schedule import Schedule
 
 logger = logging.getLogger(__name__)
 
-BATCH = 64
-"""Pictures redrawn per line of progress."""
+BATCH, BATCH_PIXELS = 64, 16_000_000
+"""Most pictures redrawn per line of progress, and pixels of their results, if they are several: for memory."""
 PICTURED = 3
 """Training views of an event with comparison pictures."""
 
@@ -55,10 +56,11 @@ class Redrawer:
         """Makes the planned pseudo views, except those with dropped pictures, and logs each batch."""
         views: list[PseudoView] = []
         pictured = sorted({spec.parent for spec in specs})[:PICTURED]
-        for first in range(0, len(specs), BATCH):
-            batch = specs[first : first + BATCH]
+        done = 0
+        for batch in batches(specs):
             views += self.redraw_batch(run, event, batch, pictured)
-            logger.info("%s at step %d: %d of %d pictures", self.name, event, first + len(batch), len(specs))
+            done += len(batch)
+            logger.info("%s at step %d: %d of %d pictures", self.name, event, done, len(specs))
         return views
 
     def redraw_batch(
@@ -146,7 +148,7 @@ class Redrawer:
     def pixel_weight(
         self, run: Run, spec: PseudoViewSpec, request: Request, result: Float[Tensor, "3 H W"], window: Window
     ) -> UInt8[Tensor, "h w"] | None:
-        """Returns pixel weights of a window of the result; None: all are 1."""
+        """Returns pixel weights of a window of the result, 0 where the photo is masked; None: all are 1."""
         options, pixel_weight = self.options, torch.ones(window.height, window.width)
         if self.weight_map is not None:
             photographs = [view.camera for view in run.train_views]
@@ -156,6 +158,9 @@ class Redrawer:
         if options.gate > 0 and request.photo and spec.scale > 1:
             agreed = agreeing(result, request.image, spec.scale, request.reduction, options.gate)
             pixel_weight = pixel_weight * window.cut(agreed[None])[0]
+        if request.photo and (counted := request.view.counted()) is not None and spec.outer is not None:
+            inside = spec.inside.cut(spec.outer.cut(counted[None].float()))
+            pixel_weight = pixel_weight * as_blocks(inside[0], spec.scale)
         return None if bool((pixel_weight == 1).all()) else in_bytes(pixel_weight)
 
     def write_comparison(self, folder: Path, spec: PseudoViewSpec, request: Request, view: PseudoView) -> None:
@@ -165,6 +170,20 @@ class Redrawer:
         difference = (0.5 + 4 * (result - source)).clamp(0, 1)
         folder.mkdir(parents=True, exist_ok=True)
         write_image(folder / picture_name(self.name, view), torch.cat([source, result, difference], 2))
+
+
+def batches(specs: Sequence[PseudoViewSpec]) -> Iterator[list[PseudoViewSpec]]:
+    """Divides pictures into batches of at most BATCH and BATCH_PIXELS, in order."""
+    batch, pixels = list[PseudoViewSpec](), 0
+    for spec in specs:
+        size = math.prod(spec.source.size) * spec.scale**2
+        if batch and (len(batch) == BATCH or pixels + size > BATCH_PIXELS):
+            yield batch
+            batch, pixels = [], 0
+        batch.append(spec)
+        pixels += size
+    if batch:
+        yield batch
 
 
 def provenance(

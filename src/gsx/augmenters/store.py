@@ -57,15 +57,16 @@ class Store:
     def recalled(self, run: Run, event: int) -> list[PseudoView]:
         """Reads the pseudo views that the run made before its interruption.
 
-        A run that became longer has other events: it continues without pseudo views until the next one.
+        A run that became longer has other events: where none of its events was at that step, it continues without
+        pseudo views until the next one.
         """
         path = self.path(run, event)
         latest = [path] if path.is_file() else self.files(run)[-1:]
         try:
-            if latest and (found := load_views(latest[0]))[1]["iterations"] != self.iterations:
+            if latest != [path] and latest and load_views(latest[0])[1]["iterations"] != self.iterations:
                 self.log_longer(event)
                 return []
-            return found[0] if latest == [path] else load_views(path)[0]
+            return load_views(path)[0]
         except (OSError, ValueError) as error:
             raise InputError(
                 f"{path} cannot be read ({error}): the run needs the pseudo views of step {event} to continue at step "

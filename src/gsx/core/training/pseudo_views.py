@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsx.core.backend import EAGER, Backend
 from gsx.core.data.camera import Camera
+from gsx.core.data.masks import black_out
 from gsx.core.data.reduction import Reduction
 from gsx.core.data.window import Window
 from gsx.core.quality.losses import photometric, ssim_map
@@ -79,8 +80,9 @@ def pseudo_loss(
     elif view.pixel_weight is None:
         loss = photometric(image, target, ssim_weight, backend)
     else:
-        maps = (1 - ssim_weight) * (image - target).abs() + ssim_weight * (1 - ssim_map(image, target))
-        loss = weighted(maps, view).mean()
+        counted = view.pixel_weight.to(image.device) > 0  # SSIM of a pixel reads its neighbours
+        unlike = 1 - ssim_map(black_out(image, counted), black_out(target, counted))
+        loss = weighted((1 - ssim_weight) * (image - target).abs() + ssim_weight * unlike, view).mean()
     if view.coarse is None:
         return loss
     reduced = view.reduction.reduce(image, view.camera.width // view.coarse.shape[2])

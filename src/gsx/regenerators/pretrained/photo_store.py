@@ -38,9 +38,10 @@ class PhotoStore:
         self.pixels = sum(view.camera.width * view.camera.height for view in views)
 
     def has(self, request: Request) -> bool:
-        """Returns whether a request is a window of a photo without mask, and all photos fit at its scale."""
+        """Returns whether a request is a photo without mask, or a window of it if all photos fit at its scale."""
+        whole = request.camera.size == request.view.camera.size
         fits = 0 < 3 * self.pixels * request.scale**2 <= 1e9 * self.gigabytes
-        return fits and request.photo and request.scale > 1 and request.view.counted() is None
+        return (whole or fits) and request.photo and request.scale > 1 and request.view.counted() is None
 
     def cut(self, request: Request) -> Float[Tensor, "3 H W"]:
         """Returns the requested window of the enlarged photo."""
