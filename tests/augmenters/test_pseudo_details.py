@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from regenerating import of_role
+from safetensors.torch import save_file
 from tiny import final_tensors, stopped_at, tiny_run, tiny_settings
 from torch import Tensor
 
@@ -673,6 +674,12 @@ def test_a_lost_file_of_pseudo_views_is_named(tmp_path: Path) -> None:
     run, settings = open_run(tmp_path / "run", plugins(), (), training=True)
     with pytest.raises(InputError, match=r"bootstrap_0000010.safetensors cannot be read.*step 10.*train anew"):
         execute(run, settings, plugins())
+
+
+def test_another_file_in_the_place_of_pseudo_views_is_refused(tmp_path: Path) -> None:
+    save_file({"weights": torch.zeros(3)}, tmp_path / "other.safetensors")
+    with pytest.raises(ValueError, match="no pseudo views"):
+        load_views(tmp_path / "other.safetensors")
 
 
 def test_files_hold_everything(tmp_path: Path) -> None:

@@ -114,12 +114,14 @@ def save_views(path: Path, views: Sequence[PseudoView], facts: dict[str, Any]) -
 
 
 def load_views(path: Path) -> tuple[list[PseudoView], dict[str, Any]]:
-    """Reads (views, facts) as `save_views` wrote them."""
+    """Reads (views, facts) as `save_views` wrote them; ValueError: the file is damaged or another one."""
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(path, framework="pt") as file:
-            content = json.loads(file.metadata()["gsx"])
+            if (text := (file.metadata() or {}).get("gsx")) is None:
+                raise ValueError("it has no pseudo views")
+            content = json.loads(text)
             names = set(file.keys())
             tensors = {name: file.get_tensor(name) for name in names}
     except SafetensorError as error:
