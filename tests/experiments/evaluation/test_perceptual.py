@@ -160,9 +160,12 @@ def test_another_file_in_the_place_of_weights_is_not_used(tmp_path: Path, monkey
     with pytest.raises(InputError, match=rf"net\.pth has sha256 {digest[:16]} instead of ffff"):
         read_known(file, "ffff", "x")
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    known = {"m": {"remedy": "copy it", "files": {"trunk": {"hub": "net.pth", "sha256": "ffff"}}}}
+    known: dict[str, Any] = {"m": {"remedy": "copy it", "files": {"trunk": {"hub": "net.pth", "sha256": "ffff"}}}}
     monkeypatch.setattr(installed_weights, "known_weights", lambda: known)
     with pytest.raises(MetricUnavailable, match="instead of ffff: copy it"):
+        installed_weights.installed_weights("m")
+    known["m"]["files"] = {"head": {"package": "pytest", "path": "pytest/no_file", "sha256": "ffff"}}
+    with pytest.raises(MetricUnavailable, match=r"has no file .*: pip install --force-reinstall --no-deps pytest"):
         installed_weights.installed_weights("m")
 
 

@@ -67,6 +67,12 @@ def test_in_words() -> None:
     assert remarks_of({"psnr": 30.0, "left_out": 0.0}) == []
 
 
+def test_a_loss_to_an_upscaler_that_rounds_to_nothing_is_no_remark() -> None:
+    zooms = {"2": {"psnr": 30.0, "upscaled_psnr": 30.004}, "4": {"psnr": 30.0, "upscaled_psnr": 30.25}}
+    (remark,) = remarks_of({"psnr": 30.0, "zoom": zooms, "competitor": {"name": "span"}})
+    assert remark == "zoomed renders lose to the x1 render enlarged by span at x4 (0.25 dB): zoom by that instead"
+
+
 def test_a_cap_that_binds_is_said_once_and_written_down(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING)
     words = ("iterations=60", "backbone.max_primitives=301", "backbone.density.gradient=1e-9", "rasterizer=eager")

@@ -274,6 +274,8 @@ def test_settings_that_a_run_is_older_than_can_be_asked_for(tmp_path: Path) -> N
         read_config(tmp_path / "config.yaml", plugins(), ["eval.lpips.net=alex"])
     with pytest.raises(ConfigError, match=r"metrics.perceptual has 'niqee'; choose from st_lpips_alex, "):
         read_config(tmp_path / "config.yaml", plugins(), [*words, "metrics.perceptual=[niqee]"])
+    with pytest.raises(ConfigError, match=r"metrics.perceptual takes a list: give metrics.perceptual=\[...\]"):
+        read_config(tmp_path / "config.yaml", plugins(), [*words, "metrics.perceptual=niqe"])
     (tmp_path / "list.yaml").write_text("- 1\n")
     with pytest.raises(ConfigError):
         read_config(tmp_path / "list.yaml", plugins(), ["eval.colours=fitted"])

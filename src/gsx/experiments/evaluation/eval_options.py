@@ -16,18 +16,32 @@ LEAST_TILE_PIXELS = 16 * 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalOptions:
+class MetricOptions:
+    """Options of the group `metrics`; values in conf/config.yaml."""
+
+    lpips: LpipsOptions
+    perceptual: list[str] = field(default_factory=list)
+    """Names of perceptual metrics."""
+    perceptual_pixels: int = 1 << 17
+    """Largest picture that networks measure as a whole; 0: any."""
+
+    def __post_init__(self) -> None:
+        if unknown := [name for name in self.perceptual if name not in METRICS]:
+            raise ValueError(f"metrics.perceptual has '{unknown[0]}'; choose from {', '.join(METRICS)}")
+        if self.perceptual_pixels and self.perceptual_pixels < LEAST_WINDOW_PIXELS:
+            raise ValueError(
+                f"metrics.perceptual_pixels is {self.perceptual_pixels}; give 0, or {LEAST_WINDOW_PIXELS} and more"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalOptions(MetricOptions):
     """Options; values in conf/config.yaml. What changes figures is saved and hashed with every result."""
 
     zoom: Annotated[list[float], Range(1 / 64, 64)]
     quantise: bool
     ssim: str
     tile_pixels: Annotated[int, Range(LEAST_TILE_PIXELS, 1 << 31)]
-    lpips: LpipsOptions
-    perceptual: list[str] = field(default_factory=list)
-    """Names of perceptual metrics, `metrics.perceptual`."""
-    perceptual_pixels: int = 1 << 17
-    """Largest picture that networks measure as a whole, `metrics.perceptual_pixels`; 0: any."""
     supersample: Annotated[int, Range(0, 16)] = 0
     """Factor by which renders are finer than each picture before they are reduced; 0: as in training."""
     colours: str = "rendered"
@@ -45,18 +59,13 @@ class EvalOptions:
     """Overrides that are suggested where a pretrained upscaler is installed and training used none; empty: none."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.ssim not in SSIM_VARIANTS:
             raise ValueError(f"eval.ssim is '{self.ssim}'; choose from {', '.join(SSIM_VARIANTS)}")
         if self.colours not in COLOURS:
             raise ValueError(f"eval.colours is '{self.colours}'; choose from {', '.join(COLOURS)}")
         if self.poses not in POSES:
             raise ValueError(f"eval.poses is '{self.poses}'; choose from {', '.join(POSES)}")
-        if unknown := [name for name in self.perceptual if name not in METRICS]:
-            raise ValueError(f"metrics.perceptual has '{unknown[0]}'; choose from {', '.join(METRICS)}")
-        if self.perceptual_pixels and self.perceptual_pixels < LEAST_WINDOW_PIXELS:
-            raise ValueError(
-                f"metrics.perceptual_pixels is {self.perceptual_pixels}; give 0, or {LEAST_WINDOW_PIXELS} and more"
-            )
         if not self.zoom:
             raise ValueError("eval.zoom is empty; give factors, for example [1,2,4]")
 

@@ -53,9 +53,18 @@ def installed_weights(metric: str) -> InstalledWeights:
             tensors[role] = read_known(path, str(place["sha256"]), f"metrics.perceptual={metric}")
             sources[role] = source
     except (OSError, InputError) as error:
-        raise MetricUnavailable(f"{error}: {entry['remedy']}") from error
+        raise MetricUnavailable(f"{error}: {again(place.get('package', ''), entry['remedy'])}") from error
     provenance = {key: entry[key] for key in ("metric", "licence")} | {"weights": sources}
     return InstalledWeights(tensors=tensors, provenance=provenance)
+
+
+def again(package: str, remedy: str) -> str:
+    """Returns how to get a missing or damaged file: pip does nothing for an installed package unless it is forced."""
+    try:
+        distribution(package)
+    except (PackageNotFoundError, ValueError):  # for an empty name
+        return remedy
+    return f"pip install --force-reinstall --no-deps {package}"
 
 
 def locate(place: Mapping[str, Any]) -> tuple[Path, str]:

@@ -14,6 +14,8 @@ logger = logging.getLogger(__name__)
 
 NOT_MEASURED = "no view is held out (scene.split=none), so quality is not measured"
 """Sentence that replaces figures."""
+LEAST_LOSS = 0.005
+"""Least loss to an upscaler that is remarked on, dB: smaller ones are 0.00."""
 CHECKS = {
     "colour": "changed their mean colour",
     "agreement": "disagree with their input",
@@ -147,7 +149,7 @@ def left_out_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
 def upscaler_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
     """Yield the zooms at which an upscaler of the x1 render comes closer to the truth than the zoomed render."""
     zooms = {factor: over_upscaled(entry) for factor, entry in part(dict(evaluation), "zoom").items()}
-    lost = [f"x{factor} ({-gain:.2f} dB)" for factor, gain in zooms.items() if gain is not None and gain < 0]
+    lost = [f"x{factor} ({-gain:.2f} dB)" for factor, gain in zooms.items() if gain is not None and gain <= -LEAST_LOSS]
     if lost:
         name = upscaler_of(dict(evaluation))
         yield f"zoomed renders lose to the x1 render enlarged by {name} at {', '.join(lost)}: zoom by that instead"

@@ -19,7 +19,7 @@ from gsx.core.rasterizer import RasterOptions, RasterSettings
 from gsx.core.rasterizer.compositor import Compositor
 from gsx.core.training.regenerator import NamesCode
 from gsx.core.training.run import TrainingOptions
-from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.eval_options import EvalOptions, MetricOptions
 from gsx.experiments.run_folder.general_options import GeneralOptions, splat_file
 from gsx.experiments.runs.typed import schema_keys, texts, typed, unknown_key
 from gsx.formats.suffixes import splat_file_at, suffix_of
@@ -131,7 +131,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         general=typed(GeneralOptions, values, ""),
         training=typed(TrainingOptions, loop, "training"),
         modules=modules,
-        evaluation=typed(EvalOptions, evaluation | metric_options(groups["metrics"]), "eval"),
+        evaluation=evaluation_options(evaluation, groups["metrics"]),
         raster=with_compositors(typed(RasterOptions, groups["rasterizer"], "rasterizer"), plugins),
         scene=single["scene"],
         backbone=single["backbone"],
@@ -151,9 +151,12 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     )
 
 
-def metric_options(group: dict[str, Any]) -> dict[str, Any]:
-    """Return the options of an evaluation that stand in the group `metrics`; an older run has only `lpips`."""
-    return {"lpips": {}} | {key: group[key] for key in ("lpips", "perceptual", "perceptual_pixels") if key in group}
+def evaluation_options(evaluation: dict[str, Any], metrics: dict[str, Any]) -> EvalOptions:
+    """Return the options of the groups `eval` and `metrics`, of which an older run has only `lpips`; ConfigError."""
+    names = {entry.name for entry in dataclasses.fields(MetricOptions)}
+    own = {"lpips": {}} | {name: value for name, value in metrics.items() if name in names}
+    typed(MetricOptions, own, "metrics")  # errors name that group
+    return typed(EvalOptions, evaluation | own, "eval")
 
 
 def plain_values(config: DictConfig) -> dict[str, Any]:
