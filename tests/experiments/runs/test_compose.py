@@ -235,6 +235,10 @@ def test_common_scene_defaults_agree_with_the_schema() -> None:
         (["training.supersampling.start=1"], "training.supersampling.start is 1.0; set a share of the steps"),
         (["backbone=scaffold", "preset=zoom"], "Unknown key 'backbone.rates.shortened'"),
         (["rasterizer.dilation=0"], "rasterizer.dilation is 0"),
+        (
+            ["regenerator.upscale.x2=a.param", "regenerator/upscale=ncnn"],
+            r"upscale\.x2 is a group of settings",
+        ),
         (["output=${oc.env:GSX_UNSET_VARIABLE}/x"], "cannot be resolved"),
     ],
 )
@@ -246,6 +250,12 @@ def test_mistakes_are_named_with_a_remedy(overrides: list[str], message: str) ->
 def test_a_number_for_a_text_is_not_silently_taken() -> None:
     with pytest.raises(ConfigError, match=r"scene\.downscale"):
         typed(SceneOptions, {"name": "x", "background": [0, 0, 0], "downscale": 1.5}, "scene")
+
+
+def test_a_path_below_the_home_folder_needs_no_quotes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shell leaves `~` within a word as it is, and Hydra's grammar has none."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert compose(["scene=colmap", "scene.path=~/photos"], plugins()).scene.options.path == str(tmp_path / "photos")
 
 
 def test_a_folder_named_by_a_number_is_a_folder() -> None:

@@ -54,12 +54,16 @@ def word_of(key: str, text: str) -> str:
 
 
 def with_quoted_paths(overrides: Sequence[str]) -> list[str]:
-    """Return overrides with existing paths such as `a=b` or `a (1)` quoted."""
+    """Return overrides with paths such as `~/a`, or existing ones such as `a=b` or `a (1)`, quoted."""
     pairs = [word.partition("=") for word in overrides]
-    return [
-        word_of(key, value) if SPECIAL.search(value) and os.path.exists(expand_home(value)) else f"{key}{equals}{value}"
-        for key, equals, value in pairs
-    ]
+    return [word_of(key, value) if needs_quotes(value) else f"{key}{equals}{value}" for key, equals, value in pairs]
+
+
+def needs_quotes(value: str) -> bool:
+    """Return True for a path that Hydra does not read: shells leave `~` within a word to programs."""
+    if SPECIAL.search(value):
+        return os.path.exists(expand_home(value))
+    return value.startswith("~")
 
 
 def parse_overrides(overrides: Sequence[str]) -> list[Any]:

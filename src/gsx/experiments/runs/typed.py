@@ -46,7 +46,7 @@ def checked(schema: type, content: Values, path: str) -> Any:
             raise ConfigError(f"{f'{path}.{key}'.lstrip('.')} is {value}; give a number {bounds}")
         return OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
-        raise ConfigError(complaint(error, schema, path)) from error
+        raise ConfigError(complaint(error, schema, path, named)) from error
     except ValueError as error:  # a dataclass refused the combination
         raise ConfigError(str(error)) from error
 
@@ -78,8 +78,8 @@ def writable(node: DictConfig, values: dict[str, Any]) -> DictConfig:
     return node
 
 
-def complaint(error: OmegaConfBaseException, schema: type, path: str) -> str:
-    """Return an error of OmegaConf as one sentence with the key."""
+def complaint(error: OmegaConfBaseException, schema: type, path: str, values: dict[str, Any]) -> str:
+    """Return an error of OmegaConf for values as one sentence with the key."""
     inner = str(error.full_key or "")
     key, text = ".".join(part for part in (path, inner) if part), first_line(error)
     if type(error).__name__ == "ConfigKeyError":
@@ -87,20 +87,20 @@ def complaint(error: OmegaConfBaseException, schema: type, path: str) -> str:
     if "is not a ListConfig" in text:
         return f"{key} takes a list: give {key}=[...], with commas between its values"
     if (group := re.search(r"is not a subclass of (\w+)", text)) is not None:
-        key = ".".join([part for part in (path, key_of_type(schema, group[1])) if part]) or key
+        key = ".".join([part for part in (path, key_of_type(schema, group[1], values)) if part]) or key
         return f"{key} is a group of settings, not a value: give {key}.NAME=VALUE"
     return f"{key}: {text}"
 
 
-def key_of_type(schema: type, name: str, prefix: str = "") -> str:
-    """Return the dotted name of the first field that is a dataclass of that name, or an empty text."""
+def key_of_type(schema: type, name: str, values: Any, prefix: str = "") -> str:
+    """Return the dotted name of the field for a dataclass of that name that has another value; empty: there is none."""
     for entry in dataclasses.fields(schema):
-        if not dataclasses.is_dataclass(entry.type):
+        if not dataclasses.is_dataclass(entry.type) or not isinstance(values, dict) or entry.name not in values:
             continue
-        key = f"{prefix}{entry.name}"
-        if entry.type.__name__ == name:  # type: ignore[union-attr]
+        key, value = f"{prefix}{entry.name}", values[entry.name]
+        if entry.type.__name__ == name and not isinstance(value, dict):  # type: ignore[union-attr]
             return key
-        if found := key_of_type(entry.type, name, f"{key}."):  # type: ignore[arg-type]
+        if found := key_of_type(entry.type, name, value, f"{key}."):  # type: ignore[arg-type]
             return found
     return ""
 
