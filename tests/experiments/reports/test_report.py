@@ -207,6 +207,7 @@ def test_both_competitors_and_neighbouring_views_are_in_the_report(tmp_path: Pat
     agreement = {"consistency": {"render": 33.0, "enlarged": 35.5, "upscaled": 32.0, "truth": 30.25, "pixels": 0.5}}
     agreement["consistency"]["detail"] = {"render": 0.75, "enlarged": 0.8, "upscaled": 0.625, "truth": 0.5}
     zoom = {"2": zoom_entry(23.5, 23.0) | upscaled | agreement, "4": zoom_entry(20.0, 21.5)}
+    zoom["3"] = zoom_entry(22.0, 21.0) | upscaled | {"upscaled_psnr": 22.03}
     folder = make_run(tmp_path / "run", result=evaluation(zoom=zoom, competitor={"name": "span"}))
     index = json.loads((folder / "renders" / "index.json").read_text())
     crop = index["zoom"][0]
@@ -217,12 +218,13 @@ def test_both_competitors_and_neighbouring_views_are_in_the_report(tmp_path: Pat
     text = page.text("zoom")
     assert "×2 23.50 23.00 +0.50 23.75 −0.25 +0.1000 win loss Real detail: 0.50 dB closer" in text
     assert "It loses by 0.25 dB to the ×1 render enlarged by span, which guesses better than the model knows." in text
+    assert "From the ×1 render enlarged by span it hardly differs: 0.03 dB." in text
     assert "×4 20.00 21.50 −1.50 +0.1000 loss" in text
     assert "×2 PSNR, dB 33.00 35.50 32.00 30.25 50 %" in page.text("agreement")
     assert "correlation of detail 0.75 0.80 0.62 0.50" in page.text("agreement")
     assert "×1 render by span, 21.00 dB" in page.text("crops")
     assert page.source.count('<figure class="winner">') == 1
-    assert "lose to the x1 render enlarged by span at x2 (0.25 dB)" in page.text("remarks")
+    assert "lose to the x1 render enlarged by span at x2 (0.25 dB), x3 (0.03 dB)" in page.text("remarks")
 
 
 def test_perceptual_figures_stand_in_cards_zooms_and_views(tmp_path: Path) -> None:
