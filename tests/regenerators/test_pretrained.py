@@ -159,7 +159,7 @@ def test_scale_1_leaves_pictures_as_they_are(shared: NetworkProcess, tmp_path: P
 def test_what_is_no_network_is_refused_before_training(shared: NetworkProcess, tmp_path: Path):
     file = nearest_file(tmp_path, 2)
     file.write_text("7767517\nnone\n")
-    with pytest.raises(InputError, match=r"nearest2\.param: .*Give another network"):
+    with pytest.raises(InputError, match=r"nearest2\.param: .*[^.]\. Give another network"):
         upscaler(shared, x2=file).check([], [2], moved=False)
 
 
@@ -326,6 +326,13 @@ def test_missing_files_are_named(tmp_path: Path, name: str, content: bytes | Non
         (tmp_path / name).write_bytes(content)
     with pytest.raises(ConfigError, match=problem):
         Pretrained(options(x2=str(tmp_path / name))).check([], [2], moved=False)
+
+
+@needs_ncnn
+def test_a_missing_file_is_named_with_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=rf": {tmp_path}/a\.param cannot be read"):
+        Pretrained(options(x2="a.param")).check([], [2], moved=False)
 
 
 @needs_ncnn

@@ -77,7 +77,8 @@ def read(path: Path, option: str) -> bytes:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise ConfigError(f"{option}: {path} cannot be read ({error.strerror}): give the path of a network") from None
+        place = path.absolute()  # a run may be continued in another folder than its own
+        raise ConfigError(f"{option}: {place} cannot be read ({error.strerror}): give the path of a network") from None
     if not content:
         raise ConfigError(f"{option}: {path} is empty: download it again")
     if content.startswith(LFS_POINTER):

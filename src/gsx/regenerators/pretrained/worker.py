@@ -122,6 +122,6 @@ def serve() -> None:
         except Refusal as error:
             send(replies, {"error": f"{error}"})
         except Exception as error:  # of any library
-            send(replies, {"error": f"{error}".partition("\n")[0] + ". Give another network."})
+            send(replies, {"error": f"{error}".partition("\n")[0].rstrip(".") + ". Give another network."})
         else:
             send(replies, {}, result)
