@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from gsx.cli.dispatch import main
 from gsx.core.errors import ConfigError
 from gsx.experiments.run_folder.run_key import comparable, composition_key, evaluated_alike, evaluation_settings
 from gsx.experiments.runs.compose import Compositions
-from gsx.experiments.runs.evaluate import advice, zoom_lines
+from gsx.experiments.runs.evaluate import zoom_lines
 from gsx.experiments.runs.explain import explain
 from gsx.experiments.runs.saved_settings import read_config
 from gsx.experiments.runs.settings import Settings
@@ -46,15 +45,6 @@ def test_it_changes_nothing_else(composed: dict[str, Settings]) -> None:
         assert other.checks == first.checks
         assert composition_key(other.resolved, "", other.idle) == composition_key(first.resolved, "", first.idle)
         assert comparable(other.resolved) == comparable(first.resolved)
-
-
-def test_a_plain_run_alone_is_advised_to_train_on_enlarged_photos(composed: dict[str, Settings]) -> None:
-    """Settings say which augmenters a run had, also where `gsx eval` opens it without them."""
-    by_network = {"competitor": {"name": "span", "networks": {}}}
-    plain = replace(composed["seed=0"], augmenters={})
-    assert "preset=zoom_prior trains on photos" in advice(by_network, plain)[0]
-    assert advice(by_network, composed["seed=0"]) == []
-    assert advice({"competitor": {"name": "lanczos"}}, plain) == []
 
 
 def test_a_name_without_its_group_is_refused_with_the_remedy() -> None:

@@ -102,16 +102,16 @@ def test_a_model_that_loses_zoomed_in_ends_with_what_to_try(finished: Path) -> N
 
 
 def test_a_plain_run_is_advised_where_a_pretrained_upscaler_is_installed(finished: Path) -> None:
-    run, settings = open_run(finished, plugins())
+    """Settings say which augmenters a run had: `gsx eval` opens it without them."""
+    _, settings = open_run(finished, plugins())
     installed = {"competitor": {"name": "span", "networks": {"x2": {}}}}
     assert settings.evaluation.advice == "preset=zoom_prior"
-    (line,) = advice(run, installed, settings.evaluation)
+    (line,) = advice(installed, settings)
     assert "preset=zoom_prior" in line
-    assert advice(run, {"competitor": {"name": "lanczos"}}, settings.evaluation) == []
-    assert advice(run, {}, settings.evaluation) == []
-    assert advice(run, installed, replace(settings.evaluation, advice="")) == []
-    run.augmenters["upscale"] = None  # type: ignore[assignment]
-    assert advice(run, installed, settings.evaluation) == []
+    assert advice({"competitor": {"name": "lanczos"}}, settings) == []
+    assert advice({}, settings) == []
+    assert advice(installed, replace(settings, augmenters={"upscale": settings.backbone})) == []
+    assert advice(installed, replace(settings, evaluation=replace(settings.evaluation, advice=""))) == []
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(finished: Path, tmp_path: Path) -> None:
