@@ -1,5 +1,6 @@
 """Enlarged photos as targets from the first step: one render serves both losses."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,9 @@ from test_pseudo_details import augmenter_of, copied_gradients, run_at
 from torch import Tensor
 
 from gsx.augmenters.redraw import batches
+from gsx.augmenters.trust import MOST_GAIN, gain, gain_over_filter, request_of
 from gsx.core.data.camera import look_at
+from gsx.core.errors import TrainingError
 from gsx.core.quality.losses import photometric, ssim_map
 from gsx.core.rasterizer import rasterize
 from gsx.core.training import render as training_render
@@ -17,7 +20,10 @@ from gsx.core.training.parameter_table import gradients, zero_grad
 from gsx.core.training.pseudo_views import PseudoView, pseudo_loss
 from gsx.core.training.trainer import backward
 
-TOGETHER = ("augmenter=super_resolved", "training.supersampling.factor=2", "training.supersampling.start=0")
+TOGETHER = (
+    *("augmenter=super_resolved", "augmenter.super_resolved.least_gain=0"),
+    *("training.supersampling.factor=2", "training.supersampling.start=0"),
+)
 
 
 def random_picture(seed: int) -> Tensor:
@@ -101,6 +107,30 @@ def test_masked_pixels_do_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(type(run.scene.train[0]), "counted", lambda view: counted)
     (view, _), *_ = augmenter_of(run).term(run, 2, 0).parts
     assert torch.equal(view.pixel_weight > 0, counted.repeat_interleave(2, 0).repeat_interleave(2, 1))
+
+
+def test_trust_is_the_gain_over_a_filter_on_reduced_photos(tmp_path: Path) -> None:
+    """0 for the filter itself, and -20 log10(0.1 / e) for an error of 0.1 where the filter has an error of e."""
+    run = run_at(tmp_path / "run", 1, *TOGETHER)
+    augmenter = augmenter_of(run)
+    assert gain_over_filter(run, augmenter.regenerator, 2, 1) == 0
+    (request,) = (request_of(run, 0, 2, 1),)
+    photo, lanczos = run.scene.train[0].image(), augmenter.regenerator.regenerate([request])[0]
+    error = float((lanczos - photo).square().mean().sqrt())
+    off = photo + torch.where(photo > 0.5, -0.1, 0.1)
+    assert gain(request, off) == pytest.approx(-20 * math.log10(0.1 / error), abs=1e-3)
+    assert gain(request, photo) == MOST_GAIN
+    with pytest.raises(TrainingError, match=r"is \(3, 2, 2\) and should be \(3, 36, 48\)"):
+        gain(request, photo[:, :2, :2])
+
+
+def test_an_upscaler_without_gain_makes_no_pseudo_views(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    run = run_at(tmp_path / "run", 1, *TOGETHER, least_gain=2.0)
+    assert augmenter_of(run).term(run, 2, 0) is None
+    assert "0.0 dB better than by Lanczos' filter < 2.0 dB, no pseudo views" in caplog.text
+    assert "augmenter.super_resolved.least_gain=0 makes them all the same" in caplog.text
+    run = run_at(tmp_path / "oracle", 1, *TOGETHER, "regenerator/upscale=oracle", least_gain=2.0)
+    assert augmenter_of(run).trust(run, 1) == (MOST_GAIN, True)
 
 
 def test_batches_are_bounded_by_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

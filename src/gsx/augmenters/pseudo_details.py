@@ -17,6 +17,7 @@ from gsx.augmenters.pseudo_options import WEIGHT_MAPS, PseudoOptions
 from gsx.augmenters.redraw import Redrawer
 from gsx.augmenters.store import Store
 from gsx.augmenters.timing import event_at, events_of, progress, span_of, stepped
+from gsx.augmenters.trust import gain_over_filter
 from gsx.core.errors import ConfigError
 from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.parameter_table import shared_colour
@@ -175,13 +176,29 @@ class PseudoDetails(Redrawing):
             run.ranks.all_gather(None)  # the others wait for the file
         return (self.store.recalled(run, event) if made is None else made), fresh
 
+    def trust(self, run: Run, event: int) -> tuple[float, bool]:
+        """Measures the regenerator on the scene's own photos; returns (its gain in dB, whether to use it)."""
+        least, name = self.options.least_gain, self.context.name
+        if not least:
+            return 0.0, True
+        gain = gain_over_filter(run, self.regenerator, max(2, *self.options.scales), event)
+        trusted = gain >= least
+        remedy = f"no pseudo views: augmenter.{name}.least_gain=0 makes them all the same"
+        logger.log(
+            logging.INFO if trusted else logging.WARNING,
+            "step %d: reduced photos are enlarged %.1f dB better than by Lanczos' filter %s %.1f dB, %s",
+            *(event, gain, ">=" if trusted else "<", least, f"{name} is used" if trusted else remedy),
+        )
+        return gain, trusted
+
     def made(self, run: Run, event: int, parents: Set[int]) -> tuple[list[PseudoView], dict[str, Any]]:
         """Makes (pseudo views of some training views, facts) of an event with the current model."""
         learnt = self.regenerator.prepare(run, self.context)
         if learnt:
             figures = ", ".join(f"{name} {value:.3g}" for name, value in learnt.items())
             logger.info("%s, regenerator at step %d: %s", self.context.name, event, figures)
-        specs = list(self.planner.specs(run, event, parents))
+        gain, trusted = self.trust(run, event)
+        specs = list(self.planner.specs(run, event, parents)) if trusted else []
         views = self.redrawer.redraw_all(run, event, specs)
         views += [
             self.redrawer.coarser_view(run, event, parent, factor)
@@ -194,6 +211,7 @@ class PseudoDetails(Redrawing):
             "iterations": self.context.iterations,
             "made": len(views),
             "learnt": learnt,
+            **({"gain": gain} if self.options.least_gain else {}),
         }
         weights = [float(view.pixel_weight.float().mean()) / 255 for view in views if view.pixel_weight is not None]
         shares = [view.provenance["consistent"] for view in views if "consistent" in view.provenance]

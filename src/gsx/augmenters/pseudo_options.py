@@ -124,6 +124,9 @@ class PseudoOptions:
     """True: the scales take turns over the events."""
     checks: Checks
     """Checks of redrawn pictures; default: those of the regenerator's role."""
+    least_gain: Annotated[float, Range(0, 1000)] = 0.0
+    """Least gain of the regenerator over Lanczos' filter on the scene's own photos, reduced and enlarged again, dB;
+    with less there are no pseudo views; 0: not measured."""
     coarser: Annotated[list[int], Range(2, 64)] = field(default_factory=list)
     """Reductions of training cameras that also count, photos as the scene reduces them, renders by box averages
     (Mipmap-GS)."""
