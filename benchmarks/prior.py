@@ -33,6 +33,8 @@ FILE, RUNS, TABLE, GAINS = "prior_cpu", "runs", "table", "gains"
 BASE, MORE = "none", "none, more steps"
 """Row that others are compared with, and the same with more steps."""
 SCENES = ",".join(SUBJECTS)
+PERCEPTUAL = "metrics.perceptual=[st_lpips_alex]"
+"""Override of an evaluation: runs of older revisions measure none."""
 FIGURES = {
     "x1": (".2f", ("psnr",)),
     "x2": (".2f", ("zoom", "2", "psnr")),
@@ -99,7 +101,11 @@ def measured(scene: str, seed: int, name: str, words: str, given: argparse.Names
         overrides.append(f"iterations={round(given.more * steps_among(SUBJECTS[scene]))}")
     folder = trained(scene, seed, given, overrides, name)
     if given.evaluate:
-        gsx(["eval", str(folder)], {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {}, folder.with_suffix(".eval.log"))
+        gsx(
+            ["eval", str(folder), PERCEPTUAL],
+            {"OMP_NUM_THREADS": "1"} if given.jobs > 1 else {},
+            folder.with_suffix(".eval.log"),
+        )
     return {"scene": scene, "name": name, "seed": seed} | figures(folder) | {"commit": commit()}
 
 
