@@ -103,13 +103,15 @@ def test_a_model_that_loses_zoomed_in_ends_with_what_to_try(finished: Path) -> N
 
 def test_a_plain_run_is_advised_where_a_pretrained_upscaler_is_installed(finished: Path) -> None:
     """Settings say which augmenters a run had: `gsx eval` opens it without them."""
-    _, settings = open_run(finished, plugins())
+    _, tiny = open_run(finished, plugins())
+    settings = replace(tiny, resolved=tiny.resolved | {"scene": {"path": "photos"}})
     installed = {"competitor": {"name": "span", "networks": {"x2": {}}}}
     assert settings.evaluation.advice == "preset=zoom_prior"
     (line,) = advice(installed, settings)
     assert "preset=zoom_prior" in line
     assert advice({"competitor": {"name": "lanczos"}}, settings) == []
     assert advice({}, settings) == []
+    assert advice(installed, tiny) == []  # ray-cast, where the prior does not help
     assert advice(installed, replace(settings, augmenters={"upscale": settings.backbone})) == []
     assert advice(installed, replace(settings, evaluation=replace(settings.evaluation, advice=""))) == []
 

@@ -125,13 +125,11 @@ def zoom_lines(factor: str, result: dict[str, Any], upscaler: str) -> list[str]:
 
 
 def advice(evaluation: dict[str, Any], settings: Settings) -> list[str]:
-    """Return what else to try: photos enlarged by an installed pretrained upscaler, if training used no augmenter."""
-    words = settings.evaluation.advice
-    if not words or settings.augmenters or "networks" not in part(evaluation, "competitor"):
+    """Return what else to try on photos: a pretrained upscaler, if one is installed and training used none."""
+    words, scene = settings.evaluation.advice, part(settings.resolved, "scene")
+    if not words or not scene.get("path") or settings.augmenters or "networks" not in part(evaluation, "competitor"):
         return []
-    return [
-        f"a pretrained upscaler is installed: {words} trains on photos that it enlarges: more detail in the same steps, about twice the time"
-    ]
+    return [f"a pretrained upscaler is installed: {words} trains on photos that it enlarges, in about twice the time"]
 
 
 def zoom_line(factor: str, result: dict[str, Any], upscaler: str = "an upscaler") -> str:
