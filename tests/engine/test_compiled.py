@@ -262,7 +262,7 @@ def test_what_goes_the_eager_way() -> None:
     eager = replace(QUICK, path="eager")
     for given, options in ((splats, {"max_weight": True}), (wide, {})):
         drawn, expected = (rasterize(given, front_camera(), rules, **options) for rules in (QUICK, eager))
-        assert torch.equal(drawn.image, expected.image)
+        torch.testing.assert_close(drawn.image, expected.image, rtol=0, atol=1e-6)  # kernels before it round otherwise
     assert not torch.equal(
         rasterize(splats, front_camera(), QUICK).image, rasterize(splats, front_camera(), eager).image
     )

@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -170,9 +171,9 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[PseudoView]:
     """Pseudo views that steps learn from."""
     learnt = list[PseudoView]()
 
-    def noted(image: Tensor, view: PseudoView, squared: bool) -> Tensor:
+    def noted(image: Tensor, view: PseudoView, *more: Any) -> Tensor:
         learnt.append(view)
-        return pseudo_loss(image, view, squared)
+        return pseudo_loss(image, view, *more)
 
     monkeypatch.setattr("gsx.core.training.pseudo_terms.pseudo_loss", noted)
     return learnt

@@ -22,7 +22,7 @@ class MetricOptions:
     lpips: LpipsOptions
     perceptual: list[str] = field(default_factory=list)
     """Names of perceptual metrics."""
-    perceptual_pixels: int = 1 << 17
+    perceptual_pixels: Annotated[int, Range(0, 1 << 31)] = 1 << 17
     """Largest picture that networks measure as a whole; 0: any."""
 
     def __post_init__(self) -> None:
