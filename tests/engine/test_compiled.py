@@ -24,6 +24,7 @@ from raster_scenes import (
 from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import rasterize
+from gsx.core.rasterizer.composite import composite_eager
 from gsx.engine import compiled, lanes
 from gsx.engine.backend import COMPILED
 from gsx.engine.compile_cache import TRACING, file_of, recorded
@@ -257,15 +258,24 @@ def test_parts_cover_everything_and_none_is_single() -> None:
         assert total == 1 or all(part.stop - part.start > 1 for part in slices)
 
 
-def test_what_goes_the_eager_way() -> None:
+def test_what_goes_the_eager_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    blended = list[int]()
+
+    def counted(screen: Any, channels: torch.Tensor, *more: Any) -> Any:
+        blended.append(len(channels))
+        return composite_eager(screen, channels, *more)
+
+    monkeypatch.setattr("gsx.engine.compiled.composite_eager", counted)
     splats, wide = random_splats(40), random_splats(40, channels=9)
     eager = replace(QUICK, path="eager")
     for given, options in ((splats, {"max_weight": True}), (wide, {})):
         drawn, expected = (rasterize(given, front_camera(), rules, **options) for rules in (QUICK, eager))
         torch.testing.assert_close(drawn.image, expected.image, rtol=0, atol=1e-6)  # kernels before it round otherwise
+    assert len(blended) == 2
     assert not torch.equal(
         rasterize(splats, front_camera(), QUICK).image, rasterize(splats, front_camera(), eager).image
     )
+    assert len(blended) == 2
     assert (QUICK.path_on("cpu"), eager.path_on("cpu"), replace(QUICK, path="auto").path_on("cpu")) == (
         "compiled",
         "eager",

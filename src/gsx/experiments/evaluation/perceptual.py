@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 Picture: TypeAlias = Float[Tensor, "3 H W"]
 Figures: TypeAlias = dict[str, dict[str, float]]
-"""By metric and by picture."""
+"""Figures by metric and by picture."""
 COMPARED = ("render", "enlarged", "upscaled")
 """Pictures of a zoom that are compared with the truth, as far as there are any."""
 
