@@ -32,6 +32,7 @@ from gsx.core.training.render import render, render_gaussians
 from gsx.core.training.run import Run
 from gsx.engine.processes import processes
 from gsx.engine.threads import watch_cores
+from gsx.experiments.minutes.planned import planned
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import evaluate_again
 from gsx.experiments.runs.export import export, refuse_export
@@ -192,7 +193,8 @@ def train(*words: str, **values: Any) -> TrainedRun:
     overrides, folders = [*words, *words_of(values)], list[Path]()
     if is_table(overrides) or processes() > 1:
         raise ConfigError("gsx.train trains one run in one process: tables and torchrun are for the command line")
-    if train_job(compose(overrides, loaded := plugins()), loaded, folders):
+    settings = planned(compose(overrides, loaded := plugins()), overrides, loaded)
+    if train_job(settings, loaded, folders):
         raise KeyboardInterrupt(f"{command('resume', folders[0])} continues")
     return load_run(folders[0])
 

@@ -17,6 +17,8 @@ from gsx.core.plugins import Plugins
 from gsx.engine.cache import in_use
 from gsx.engine.processes import say, speaks
 from gsx.engine.signals import INTERRUPTED
+from gsx.experiments.minutes.clock import process_start
+from gsx.experiments.minutes.planned import planned, with_default_time
 from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.claims import claimed
 from gsx.experiments.run_folder.files import read_run, reported, state_of
@@ -26,7 +28,7 @@ from gsx.experiments.runs.history import record_changes
 from gsx.experiments.runs.inspect import scene_loaders
 from gsx.experiments.runs.launched import ended_from_without, is_launched, waiting_for_all
 from gsx.experiments.runs.logs import set_up_logging
-from gsx.experiments.runs.multirun import check_overrides, hydra_main, job_place, launch
+from gsx.experiments.runs.multirun import check_overrides, hydra_main, job_overrides, job_place, launch
 from gsx.experiments.runs.open import open_run, refuse_other, stamped_folder
 from gsx.experiments.runs.overrides import quoted, with_quoted_paths, word_of
 from gsx.experiments.runs.saved_settings import write_config
@@ -37,8 +39,11 @@ from gsx.experiments.tables.sweep import is_table, run_table
 logger = logging.getLogger("gsx.cli")
 
 
-def train(words: list[str]) -> int:
-    """Train one run, several (`-m`) or a table, or let Hydra print something, by the words of the command line."""
+def train(words: list[str], photos: bool = False) -> int:
+    """Train one run, several (`-m`) or a table, or let Hydra print something, by the words of the command line.
+
+    photos: the scene is somebody's folder, for which a CPU has a default time.
+    """
     several = bool({"-m", "--multirun"} & set(words))
     if several:
         return train_several(words)
@@ -47,7 +52,9 @@ def train(words: list[str]) -> int:
     if is_table(words):
         return fill_table(words)
     folders: list[Path] = []
-    code = job.train(compose(words, loaded := plugins()), loaded, folders)
+    words = with_default_time(words, photos=photos or "scene=photos" in words)
+    settings = planned(compose(words, loaded := plugins()), words, loaded, process_start())
+    code = job.train(settings, loaded, folders)
     return print_report(code, folders[0])
 
 
@@ -126,7 +133,8 @@ def sweep_job(config: Any) -> int:
     place = job_place()
     try:
         with ended_from_without(place[0]) if place else nullcontext():
-            code = job.train(settings_from(config, loaded := plugins()), loaded, folders)
+            settings = planned(settings_from(config, loaded := plugins()), job_overrides(), loaded)
+            code = job.train(settings, loaded, folders)
     except KeyboardInterrupt:
         if not is_launched():
             raise
@@ -171,7 +179,7 @@ def train_folder(arguments: list[str]) -> int:
     kind = "a video" if path.is_file() and scene == "photos" else f"read as scene={scene}"
     logger.info("%s is %s", path, kind)
     logger.info("%s", command(*words, *overrides))
-    return train([*words, *overrides])
+    return train([*words, *overrides], photos=True)
 
 
 def scene_words(path: Path, overrides: Sequence[str], loaded: Plugins) -> list[str]:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from gsx.core.training.module import TrainingModule
 from gsx.modules.blur import Blur, BlurOptions
 from gsx.modules.coarse_to_fine import CoarseToFine, CoarseToFineOptions
+from gsx.modules.deadline import Deadline, DeadlineOptions
 from gsx.modules.distractors import DistractorOptions, Distractors
 from gsx.modules.exposure import Exposure, ExposureOptions
 from gsx.modules.plateau import Plateau, PlateauOptions
@@ -15,6 +16,7 @@ MODULES: Mapping[str, tuple[type[TrainingModule], type]] = {
     "coarse_to_fine": (CoarseToFine, CoarseToFineOptions),
     "supersampling": (Supersampling, SupersamplingOptions),
     "plateau": (Plateau, PlateauOptions),
+    "deadline": (Deadline, DeadlineOptions),
     "poses": (Poses, PoseOptions),
     "exposure": (Exposure, ExposureOptions),
     "blur": (Blur, BlurOptions),

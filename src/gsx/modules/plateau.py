@@ -19,11 +19,11 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Float
-from gsx.core.training.backbone import WithMilestones
 from gsx.core.training.importance import Probe
 from gsx.core.training.module import ModuleContext, TrainingModule
 from gsx.core.training.run import Run
 from gsx.core.training.validation import decibels, rounding_in, validation_windows
+from gsx.modules.milestones import last_milestone
 
 logger = logging.getLogger(__name__)
 
@@ -175,13 +175,6 @@ class Plateau(TrainingModule):
             return {}
         metrics = {"step_gain": float(self.gains[-1, 1]), "step_price": self.options.price}
         return metrics | ({"steps_left_out": len(self.skipped)} if step == self.skipped.stop else {})
-
-
-def last_milestone(run: Run, before: int) -> int:
-    """Returns the last milestone of modules or backbone before a step."""
-    steps = list(run.backbone.milestones()) if isinstance(run.backbone, WithMilestones) else []
-    steps += [step for module in run.modules.values() for step in module.milestones()]
-    return max((step for step in steps if step < before), default=0)
 
 
 def errors_in(run: Run, windows: Mapping[View, Window], step: int) -> Float[Tensor, "W"]:

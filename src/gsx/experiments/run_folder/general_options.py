@@ -25,6 +25,10 @@ class GeneralOptions:
     iterations: Steps
     """0: evaluate the splat file of `init` as it is."""
     seed: Seed
+    minutes: Annotated[float, Range(0, 10**6)] = without_effect(default=0.0)
+    """Wall time from the command to the report, by which the run is planned; 0: by steps."""
+    seconds: Annotated[float, Range(0, 10**8)] = without_effect(default=0.0)
+    """The same in seconds."""
     device: str = without_effect()
     output: str = without_effect()
     folder: str = without_effect()
@@ -46,6 +50,8 @@ class GeneralOptions:
     viewer_share: Share = without_effect(default=0.25)
 
     def __post_init__(self) -> None:
+        if self.minutes and self.seconds:
+            raise ValueError(f"minutes is {self.minutes:g} and seconds {self.seconds:g}: give one of them")
         file = splat_file(self.init)
         if file is not None and not suffix_of(file):
             raise ValueError(f"init is '{self.init}'; choose scratch, warm_start, or a splat file ({READABLE})")

@@ -25,7 +25,13 @@ PICTURES = (".webp", ".png")
 """Suffixes of an unbundled SOG's pictures."""
 NOT_COMPARED = "eval.competitor"
 """Node that changes no figure of the model: two runs may differ in it."""
-UNCHANGED = {"scene.model": "auto", "scene.distances": "even"}
+NO_DEADLINE = {"name": "deadline", "seconds": 0.0, "steps": 0, "planned": [], "start": 0.5, "to": 0.8, "skip": []}
+"""Options of a run without a deadline."""
+UNCHANGED = {
+    "scene.model": "auto",
+    "scene.distances": "even",
+    **{f"training.deadline.{key}": value for key, value in NO_DEADLINE.items()},
+}
 """Keys newer than the first digests, with their neutral values, which do not count."""
 
 

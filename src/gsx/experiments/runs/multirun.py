@@ -146,3 +146,10 @@ def job_place() -> tuple[Path, int] | None:
     if not HydraConfig.initialized() or OmegaConf.is_missing(HydraConfig.get().job, "num"):
         return None
     return Path(HydraConfig.get().sweep.dir), int(HydraConfig.get().job.num)
+
+
+def job_overrides() -> list[str]:
+    """Return the overrides of the job that runs in this process; empty outside of a multirun."""
+    from hydra.core.hydra_config import HydraConfig
+
+    return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []

@@ -7,6 +7,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from gsx.core.data.scene import Scene
 from gsx.core.errors import CheckpointError, ConfigError, InputError, command
@@ -116,7 +117,7 @@ def make_folder(
         refuse_used(settings.general.folder)  # another process may have been faster
     try:
         write_config(run.folder / "config.yaml", settings.resolved)
-        facts = environment(run, plugins, settings.idle) | ({"start": doubts} if doubts else {})
+        facts = environment(run, plugins, settings.idle) | ({"start": doubts} if doubts else {}) | plan_facts(settings)
         write_json(run.folder / "environment.json", facts)
         if settings.general.init == "warm_start":
             warm_start.adopt(run, warm_start.warm_start_folder(run, settings.idle, plugins.versions))
@@ -125,6 +126,13 @@ def make_folder(
         shutil.rmtree(run.folder, ignore_errors=True)
         raise
     return run.folder
+
+
+def plan_facts(settings: Settings) -> dict[str, Any]:
+    """Return what environment.json says of a plan by wall time; empty: there is none."""
+    if not settings.time_plan:
+        return {}
+    return {"minutes": settings.time_plan | {"repeat": list(settings.repeat)}}
 
 
 def refuse_other(folder: Path) -> None:

@@ -106,6 +106,10 @@ class Settings:
     """All of it as plain values, for config.yaml."""
     idle: frozenset[str]
     """Dotted keys that do not change the training."""
+    repeat: tuple[str, ...] = ()
+    """Words that train the same without a plan; empty: those of the command line."""
+    time_plan: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Facts of a plan by wall time, for environment.json; empty: there is none."""
 
 
 def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Settings:

@@ -1,0 +1,1 @@
+"""Runs planned by wall time: `minutes=N`."""

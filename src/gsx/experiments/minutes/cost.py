@@ -1,0 +1,129 @@
+"""Cost model of training: seconds of a step by its pixels and primitives, and their sum over a schedule."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from gsx.experiments.minutes.options import CostOptions
+
+MILLION = 1e6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """Seconds measured on this machine and scene, before a plan."""
+
+    base: float
+    """Seconds of a step without pixels, with the primitives at the start."""
+    megapixel: float
+    """Seconds of a step per 10^6 pixels."""
+    pixels: float
+    """Mean pixels of a training view in the measurement."""
+    downscale: int
+    """Reduction of the photos in the measurement."""
+    primitives: int
+    """Rows of the model's table at the start."""
+    photo: float
+    """Seconds until a training photo is on the device for the first time."""
+    evaluate: float
+    """Seconds to evaluate one test view at all zooms."""
+    check: float
+    """Seconds to render a test view at x1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """Stretch of a schedule at one resolution."""
+
+    start: float
+    """Share of the steps at which it begins."""
+    stop: float
+    """Share of the steps at which it ends."""
+    scale: float
+    """Sides of its renders, of those of photos."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Growth:
+    """Rows of a table over a run: a power of the share of the growth, then constant."""
+
+    first: int
+    last: int
+    start: float
+    """Share of the steps at which growth begins."""
+    stop: float
+    """Share of the steps at which growth ends."""
+    power: float
+
+    def at(self, share: float) -> float:
+        """Returns the rows at a share of the steps."""
+        passed = min(1.0, max(0.0, (share - self.start) / max(self.stop - self.start, 1e-9)))
+        return self.first + (self.last - self.first) * passed**self.power
+
+
+def stages_of(coarse: int, coarse_until: float, fine: int, fine_from: float) -> list[Stage]:
+    """Returns the stages of a schedule with coarse views first, halved in equal times, and finer renders at last.
+
+    Args:
+        coarse: Reduction of the first views, a power of two; 1: none.
+        coarse_until: Share of the steps on coarse views.
+        fine: Resolution of the last renders relative to photos; 1: none.
+        fine_from: Share of the steps before them.
+    """
+    halvings = coarse.bit_length() - 1 if coarse_until > 0 else 0
+    edges = [coarse_until * number / halvings for number in range(halvings + 1)] if halvings else [0.0]
+    stages = [Stage(start=edges[n], stop=edges[n + 1], scale=2.0 ** (n - halvings)) for n in range(halvings)]
+    plain_until = max(edges[-1], fine_from if fine > 1 else 1.0)
+    stages.append(Stage(start=edges[-1], stop=plain_until, scale=1.0))
+    stages.append(Stage(start=plain_until, stop=1.0, scale=float(fine)))
+    return [stage for stage in stages if stage.stop > stage.start]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepCost:
+    """Seconds of a step: base + pixels + primitives."""
+
+    base: float
+    pixel: float
+    row: float
+
+    def seconds(self, pixels: float, rows: float) -> float:
+        """Returns the seconds of a step."""
+        return self.base + self.pixel * pixels + self.row * rows
+
+
+def step_cost(measurement: Measurement, options: CostOptions, backbone: str) -> StepCost:
+    """Returns the cost of a step by a measurement at the start and the relative costs of the options."""
+    pixel = options.late * measurement.megapixel / MILLION
+    row = measurement.megapixel / MILLION * options.primitives * options.rows.get(backbone, 1.0)
+    return StepCost(base=max(0.0, measurement.base - row * measurement.primitives), pixel=pixel, row=row)
+
+
+SHARES = 40
+"""Equal shares of the steps in which planned seconds are summed."""
+
+
+def planned_seconds(cost: StepCost, stages: Sequence[Stage], growth: Growth, pixels: float, steps: int) -> list[float]:
+    """Returns the seconds of training after each of SHARES equal shares of the steps.
+
+    Args:
+        cost: Cost of a step.
+        stages: Stages that cover the schedule.
+        growth: Rows over the schedule.
+        pixels: Pixels of a training view.
+        steps: Steps of the run.
+    """
+    total, sums = 0.0, list[float]()
+    for number in range(SHARES):
+        parts = stage_parts(stages, number / SHARES, (number + 1) / SHARES)
+        rows = growth.at((number + 0.5) / SHARES)
+        total += sum(steps * share * cost.seconds(pixels * stage.scale**2, rows) for stage, share in parts)
+        sums.append(total)
+    return sums
+
+
+def stage_parts(stages: Sequence[Stage], start: float, stop: float) -> Iterator[tuple[Stage, float]]:
+    """Yields the stages between two shares of the steps, with the length of their common part."""
+    for stage in stages:
+        common = min(stop, stage.stop) - max(start, stage.start)
+        if common > 0:
+            yield stage, common

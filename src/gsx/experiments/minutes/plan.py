@@ -1,0 +1,195 @@
+"""Plan of a run that ends after a given wall time: size, steps, growth and resolution over the steps."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from gsx.core.errors import ConfigError
+from gsx.core.options import flattened
+from gsx.experiments.minutes.cost import Growth, Measurement, StepCost, planned_seconds, stages_of, step_cost
+from gsx.experiments.minutes.options import PlanOptions
+from gsx.experiments.runs.settings import Settings
+
+SIZE, CAPACITY, BUDGET = "scene.downscale", "backbone.capacity", "backbone.budget.primitives"
+CHECKS, FINE_FROM = "training.test_points", "training.supersampling.start"
+MOST_DOWNSCALE = 64
+"""Largest reduction of photos."""
+CHECKED = 8
+"""Most test views that are rendered for a point of the curve."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """Run to plan."""
+
+    settings: Settings
+    given: frozenset[str]
+    """Keys whose values the plan keeps."""
+    views: int
+    """Training views."""
+    tests: int
+    """Test views."""
+    seconds: float
+    """Wall time from now until the report."""
+    published: int
+    """Steps of the published run."""
+    measurement: Measurement
+    options: PlanOptions
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Values of the settings by dotted key, with those of planned runs."""
+        config = flattened(self.settings.resolved)
+        planned = {key: value for key, value in self.options.schedule.items() if key in config}
+        return config | {key: value for key, value in planned.items() if key not in self.given}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """A planned run."""
+
+    steps: int
+    downscale: int
+    primitives: int
+    """Rows when growth ends."""
+    planned: Sequence[float]
+    """Seconds of training after equal shares of the steps."""
+    other: float
+    """Seconds of photos, evaluation and report."""
+
+    @property
+    def seconds(self) -> float:
+        """Seconds from now until the report."""
+        return self.planned[-1] + self.other
+
+
+def plan_run(task: Task) -> Plan:
+    """Plans a run: the finest photos over which the time allows enough passes, and as many steps as it allows.
+
+    Raises:
+        ConfigError: the time is not enough for the fewest steps.
+    """
+    options = task.options
+    enough = min(task.published, max(options.least_steps, math.ceil(options.passes * task.views)))
+    plans = [plan_at(task, size) for size in sizes_of(task)]
+    chosen = next((plan for plan in plans if plan.steps >= enough), plans[-1])
+    if chosen.seconds > task.seconds or chosen.steps < options.least_steps:
+        raise ConfigError(too_short(task, chosen))
+    return chosen
+
+
+def too_short(task: Task, shortest: Plan) -> str:
+    """Returns the error for a time that is not enough."""
+    least = task.options.least_steps
+    needed = shortest.other + shortest.planned[-1] / shortest.steps * least
+    return (
+        f"{max(0.0, task.seconds):.0f} s are left for training, evaluation and report, and {least} steps at "
+        f"1/{shortest.downscale} size take about {needed:.0f} s: give more minutes"
+    )
+
+
+def sizes_of(task: Task) -> list[int]:
+    """Returns the reductions of photos to choose from, finest first; the present one alone if it is given."""
+    measurement = task.measurement
+    if SIZE in task.given or SIZE not in task.values:
+        return [measurement.downscale]
+    full = measurement.pixels * measurement.downscale**2
+    sizes = [1 << power for power in range(MOST_DOWNSCALE.bit_length())]
+    usable = [size for size in sizes if task.options.least_pixels <= full / size**2 <= task.options.most_pixels]
+    return usable or [measurement.downscale]
+
+
+def plan_at(task: Task, downscale: int) -> Plan:
+    """Returns the plan with the most steps at a reduction of the photos."""
+    other = other_seconds(task, downscale)
+    left = task.seconds * task.options.used - other
+    low, high = 1, task.published
+    while low < high:
+        middle = (low + high + 1) // 2
+        if training_seconds(task, downscale, middle)[-1] <= left:
+            low = middle
+        else:
+            high = middle - 1
+    return Plan(
+        steps=low,
+        downscale=downscale,
+        primitives=growth_of(task, downscale, low).last,
+        planned=training_seconds(task, downscale, low),
+        other=other,
+    )
+
+
+def pixels_at(task: Task, downscale: int) -> float:
+    """Returns the pixels of a training view."""
+    return task.measurement.pixels * (task.measurement.downscale / downscale) ** 2
+
+
+def other_seconds(task: Task, downscale: int) -> float:
+    """Returns the seconds of photos, evaluation and report."""
+    measurement, larger = task.measurement, pixels_at(task, downscale) / task.measurement.pixels
+    checks = task.values[CHECKS] * min(task.tests, CHECKED) * measurement.check
+    drawn = larger * (task.tests * measurement.evaluate + checks)
+    return task.views * measurement.photo + drawn + task.options.report
+
+
+def training_seconds(task: Task, downscale: int, steps: int) -> list[float]:
+    """Returns the seconds of training after equal shares of the steps."""
+    values = task.values
+    coarse = values.get("training.coarse_to_fine.factor", 1), values.get("training.coarse_to_fine.until", 0.0)
+    fine = values.get("training.supersampling.factor", 1), values.get(FINE_FROM, 0.0)
+    growth, pixels = growth_of(task, downscale, steps), pixels_at(task, downscale)
+    return planned_seconds(cost_of(task), stages_of(*coarse, *fine), growth, pixels, steps)
+
+
+def cost_of(task: Task) -> StepCost:
+    """Returns the cost of a step of the task's backbone."""
+    return step_cost(task.measurement, task.options.cost, task.settings.backbone.component.name)
+
+
+def growth_of(task: Task, downscale: int, steps: int) -> Growth:
+    """Returns the rows of the model over the run."""
+    first, options, values = task.measurement.primitives, task.options, task.values
+    wanted = options.density * pixels_at(task, downscale) * math.sqrt(task.views)
+    last = min(wanted, first + options.most_growth * steps / 1000)
+    if values.get(CAPACITY) == "budget" and CAPACITY in task.given:
+        last = values[BUDGET]
+    start, stop = growth_window(task)
+    return Growth(first=first, last=max(1, round(last)), start=start, stop=stop, power=0.5)
+
+
+def growth_window(task: Task) -> tuple[float, float]:
+    """Returns the shares of the steps between which primitives are added."""
+    values = task.values
+    for group in ("backbone.density", "backbone.growth"):
+        if f"{group}.start" in values:
+            return values[f"{group}.start"] / task.published, min(1.0, values[f"{group}.stop"] / task.published)
+    return 0.0, 0.5
+
+
+def changes_of(task: Task, plan: Plan) -> Mapping[str, Any]:
+    """Returns the values by dotted key that make a planned run."""
+    values, given = task.values, task.given
+    changes: dict[str, Any] = {key: values[key] for key in task.options.schedule if key in values and key not in given}
+    changes["iterations"] = plan.steps
+    if SIZE in values and SIZE not in given:
+        changes[SIZE] = plan.downscale
+    if values.get(CAPACITY) == "published" and CAPACITY not in given:
+        changes |= {CAPACITY: "budget", BUDGET: plan.primitives}
+    return changes | deadline_of(values, plan)
+
+
+def deadline_of(values: Mapping[str, Any], plan: Plan) -> dict[str, Any]:
+    """Returns the deadline of a planned run: its last stretch begins with finer renders."""
+    fine = values.get("training.supersampling.factor", 1) > 1
+    below = "training.deadline"
+    return {
+        f"{below}.seconds": round(plan.planned[-1], 1),
+        f"{below}.steps": plan.steps,
+        f"{below}.planned": [round(seconds, 2) for seconds in plan.planned],
+        **({f"{below}.to": values[FINE_FROM]} if fine and values[FINE_FROM] >= LEAST_TO else {}),
+    }
+
+
+LEAST_TO = 0.5
+"""Least share of the steps before a last stretch."""

@@ -1,0 +1,149 @@
+"""Settings of a run that ends after `minutes=N`: planned, logged with the command that repeats it, and recorded."""
+
+import logging
+import math
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+from gsx.core.errors import ConfigError, command
+from gsx.core.plugins import Plugins
+from gsx.engine.processes import processes
+from gsx.experiments.minutes.options import PlanOptions, plan_options
+from gsx.experiments.minutes.overriding import overridden
+from gsx.experiments.minutes.plan import SIZE, Plan, Task, changes_of, plan_run
+from gsx.experiments.minutes.probe import measure
+from gsx.experiments.runs.build import choose_device
+from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.overrides import word_of
+from gsx.experiments.runs.settings import Settings
+
+logger = logging.getLogger(__name__)
+
+TIMES = ("minutes", "seconds")
+LENGTHS = ("iterations", "length", "budget", "budget.share")
+"""Keys that choose the number of steps."""
+PUBLISHED = "length=published"
+"""Word for the steps of the published run."""
+
+
+def given_keys(words: Iterable[str]) -> frozenset[str]:
+    """Returns the keys that words of the command line set."""
+    return frozenset(word.partition("=")[0].lstrip("+~") for word in words)
+
+
+def with_default_time(words: Sequence[str], photos: bool) -> list[str]:
+    """Returns words with the default minutes for photos on a CPU, unless they choose a length; without PUBLISHED.
+
+    Args:
+        words: Words of the command line.
+        photos: Whether the words train on somebody's photos: `gsx FOLDER`, or scene=photos.
+    """
+    kept = [word for word in words if word != PUBLISHED]
+    chosen = given_keys(words) & {*TIMES, *LENGTHS, "variant", "dataset", "init"}
+    if not photos or chosen or len(kept) < len(words) or processes() > 1 or not on_cpu(kept):
+        return kept
+    return [*kept, f"minutes={plan_options().default:g}"]
+
+
+def on_cpu(words: Iterable[str]) -> bool:
+    """Returns whether words of the command line train on a CPU."""
+    chosen = [word.partition("=")[2] for word in words if word.startswith("device=")]
+    return choose_device(chosen[-1] if chosen else "auto").type == "cpu"
+
+
+def planned(settings: Settings, words: Sequence[str], loaded: Plugins, started: float | None = None) -> Settings:
+    """Returns settings with a plan that ends after their `minutes` or `seconds`; the same settings if both are 0.
+
+    Args:
+        settings: Composed settings.
+        words: Words of the command line that they are composed of; the plan keeps the values that these set.
+        loaded: Plugins.
+        started: Time of `time.monotonic` at which the wall time began; None: now.
+
+    Raises:
+        ConfigError: other words choose a length as well, or the time is not enough.
+        InputError: the scene cannot be loaded.
+    """
+    asked = 60 * settings.general.minutes or settings.general.seconds
+    if not asked:
+        return settings
+    started, given, options = time.monotonic() if started is None else started, given_keys(words), plan_options()
+    refuse(settings, given)
+    task = task_of(settings, given, asked, started, options, loaded)
+    plan = plan_run(task)
+    changes = {"minutes": 0.0, "seconds": 0.0, **changes_of(task, plan)}
+    again = [word for word in words if word.partition("=")[0] not in TIMES]
+    again += [word_of(key, text_of(value)) for key, value in changes.items() if key not in TIMES and not of_clock(key)]
+    announce(task, plan, asked, time.monotonic() - started, again)
+    facts = {"asked_s": asked, "planned_s": round(time.monotonic() - started + plan.seconds, 1), "steps": plan.steps}
+    return replace(overridden(settings, changes, loaded), repeat=tuple(again), time_plan=facts)
+
+
+def of_clock(key: str) -> bool:
+    """Returns whether a key belongs to the deadline, which the repeated run does not need."""
+    return key.startswith("training.deadline.")
+
+
+def refuse(settings: Settings, given: frozenset[str]) -> None:
+    """Raises ConfigError for words that minutes=N cannot be combined with."""
+    name = "minutes" if settings.general.minutes else "seconds"
+    if both := sorted(given & set(LENGTHS)):
+        raise ConfigError(f"{name}=N chooses the number of steps, and {both[0]} does, too: leave one of them out")
+    if settings.general.reuse:
+        raise ConfigError(
+            f"{name}=N plans by the speed of this machine, and reuse=true names the folder by the settings: leave one "
+            "of them out, or run the command that the plan logs with reuse=true"
+        )
+    if processes() > 1:
+        raise ConfigError(f"{name}=N plans for one process: call gsx without torchrun, or give iterations=N")
+
+
+def task_of(
+    settings: Settings, given: frozenset[str], asked: float, started: float, options: PlanOptions, loaded: Plugins
+) -> Task:
+    """Measures this machine on the scene and returns what is to be planned."""
+    downscale = probe_downscale(settings, given, options)
+    logger.info("measuring a few steps to plan %s ...", in_words(asked))
+    measurement, scene = measure(settings, downscale, options.probe, loaded)
+    return Task(
+        settings=settings,
+        given=given,
+        views=len(scene.train),
+        tests=len(scene.test),
+        seconds=asked - (time.monotonic() - started),
+        published=settings.general.iterations,
+        measurement=measurement,
+        options=options,
+    )
+
+
+def probe_downscale(settings: Settings, given: frozenset[str], options: PlanOptions) -> int:
+    """Returns the reduction of photos to measure at: the given one, else one of small pictures."""
+    present = getattr(settings.scene.options, "downscale", None)
+    if present is None or SIZE in given:
+        return present or 1
+    camera = load_scene(settings).train[0].camera
+    factor = math.sqrt(camera.width * camera.height / options.probe.pixels)
+    return max(2, 1 << math.ceil(math.log2(max(1.0, factor))))
+
+
+def announce(task: Task, plan: Plan, asked: float, used: float, again: Sequence[str]) -> None:
+    """Logs the plan, what to choose instead, and the command for the same bits."""
+    size = f" at 1/{plan.downscale} size" if plan.downscale > 1 else ""
+    logger.info(
+        "about %s: %s steps%s, up to %s primitives; minutes=%g for more, %s for %s steps",
+        *(in_words(used + plan.seconds), f"{plan.steps:,}", size, f"{plan.primitives:,}"),
+        *(math.ceil(3 * asked / 60), PUBLISHED, f"{task.published:,}"),
+    )
+    logger.info("the same training without a clock: %s", command(*again))
+
+
+def in_words(seconds: float) -> str:
+    """Formats seconds as minutes, short times as seconds."""
+    return f"{seconds:.0f} seconds" if seconds < 100 else f"{seconds / 60:.1f} minutes"
+
+
+def text_of(value: object) -> str:
+    """Returns a planned value as text of the command line."""
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,117 @@
+"""Short measurement before a plan: steps at two sizes, photos, and the evaluation of one view."""
+
+import logging
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from gsx.core.data.scene import Scene, View
+from gsx.core.plugins import Plugins, load_plugins
+from gsx.core.training.render import render
+from gsx.core.training.run import Run
+from gsx.core.training.trainer import train_step
+from gsx.experiments.evaluation.chosen_views import evenly
+from gsx.experiments.evaluation.evaluator import Evaluator
+from gsx.experiments.minutes.cost import MILLION, Measurement
+from gsx.experiments.minutes.options import ProbeOptions
+from gsx.experiments.minutes.overriding import overridden
+from gsx.experiments.reports.pictures import Pictures
+from gsx.experiments.runs.build import build
+from gsx.experiments.runs.evaluate import competitor_of
+from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.rasterizer_path import warm
+from gsx.experiments.runs.settings import Settings
+
+LENGTH = 30_000
+"""Steps of the run that is measured: its schedules change nothing within the first steps."""
+COARSE = 2
+"""Reduction of the first, smaller views."""
+SAMPLES = 3
+"""Test views that are timed."""
+LEAST = 0.1
+"""Least share of a step's time that pixels are taken to cost: noise may hide their cost."""
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Holds back messages of runs that are only measured."""
+    logging.disable(logging.INFO)
+    try:
+        yield
+    finally:
+        logging.disable(logging.NOTSET)
+
+
+def measure(settings: Settings, downscale: int, options: ProbeOptions, loaded: Plugins) -> tuple[Measurement, Scene]:
+    """Trains a few steps of a run that is thrown away; returns seconds, and the scene at the measured size."""
+    short = overridden(settings, probe_changes(settings, downscale, options), loaded)
+    short = replace(short, augmenters={})
+    with quiet():
+        scene = load_scene(short)
+        run = build(short, replace(scene, train=evenly(scene.train, options.steps)), Path(), training=True)
+    warm(run)
+    photo = median_seconds(run.photos.of, run.scene.train)
+    for view in run.views.at(1):
+        run.photos.of(view)
+    small, large = (median_step(run, options) for _ in range(COARSE))
+    pixels = statistics.fmean(view.camera.width * view.camera.height for view in scene.train)
+    megapixel = max(large - small, LEAST * large) / (pixels * (1 - COARSE**-2)) * MILLION
+    measurement = Measurement(
+        base=max(0.0, large - megapixel * pixels / MILLION),
+        megapixel=megapixel,
+        pixels=pixels,
+        downscale=downscale,
+        primitives=len(run.backbone.table),
+        photo=photo,
+        evaluate=evaluation_seconds(run, short),
+        check=median_seconds(lambda view: render(run, view.camera), scene.test[:SAMPLES]),
+    )
+    return measurement, scene
+
+
+def probe_changes(settings: Settings, downscale: int, options: ProbeOptions) -> dict[str, object]:
+    """Returns the options of the measured run by dotted key: coarse views first, then the photos' size."""
+    until = (options.warm + options.steps) / LENGTH
+    changes: dict[str, object] = {"iterations": LENGTH}
+    changes |= {"training.coarse_to_fine.factor": COARSE, "training.coarse_to_fine.until": until}
+    if hasattr(settings.scene.options, "downscale"):
+        changes["scene.downscale"] = downscale
+    return changes
+
+
+def median_step(run: Run, options: ProbeOptions) -> float:
+    """Returns the median seconds of some steps, after those that warm up."""
+    silent = load_plugins([], points=[])
+    times = []
+    for _ in range(options.warm + options.steps):
+        start = time.perf_counter()
+        train_step(run, silent)
+        times.append(time.perf_counter() - start)
+    return statistics.median(times[options.warm :])
+
+
+def median_seconds(use: Callable[[View], object], views: list[View]) -> float:
+    """Returns the median seconds of a function of a view; 0 without views."""
+    times = []
+    for view in views:
+        start = time.perf_counter()
+        use(view)
+        times.append(time.perf_counter() - start)
+    return statistics.median(times) if times else 0.0
+
+
+def evaluation_seconds(run: Run, settings: Settings) -> float:
+    """Returns the seconds to evaluate one test view at all zooms; 0 without test views."""
+    if not run.scene.test:
+        return 0.0
+    with TemporaryDirectory() as folder, quiet():
+        first = replace(run.scene, test=run.scene.test[:1])
+        one = replace(run, views=replace(run.views, scene=first), folder=Path(folder))
+        evaluator = Evaluator(one, settings.evaluation, competitor_of(one, settings))
+        start = time.perf_counter()
+        evaluator.evaluate(Pictures(one.folder, one.step))
+        return time.perf_counter() - start

@@ -1,0 +1,173 @@
+"""Deadline: a run that falls behind its planned time skips steps, and keeps the end of its schedule.
+
+`minutes=N` plans a run and sets these options. While the run keeps to its plan, the clock changes nothing.
+"""
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import torch
+from torch import Tensor
+
+from gsx.core.ranges import MOST_STEPS, Range, Seconds, Share, Steps
+from gsx.core.training.module import ModuleContext, TrainingModule
+from gsx.core.training.run import Run
+from gsx.modules.milestones import last_milestone
+
+logger = logging.getLogger(__name__)
+
+MEASURED = 8
+"""Steps of the last stretch whose pace is measured before any are skipped there."""
+SLACK = 0.03
+"""Share of the planned time by which the last stretch may be late before steps are skipped there."""
+LEAST_END = 0.5
+"""Share of the steps left in the last stretch that is always taken."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeadlineOptions:
+    """Options; values in conf/module/deadline.yaml."""
+
+    seconds: Seconds = 0.0
+    """Seconds of training; 0: no deadline."""
+    steps: Steps = 0
+    """Steps of the planned run; a run of another length has no deadline."""
+    planned: list[float] = field(default_factory=list)
+    """Planned seconds of training after equal shares of the steps, the last: all."""
+    start: Share = 0.5
+    """Share of the steps before any are skipped; later if a milestone is later."""
+    to: Share = 0.8
+    """Share of the steps at which the last stretch begins."""
+    skip: Annotated[list[int], Range(1, MOST_STEPS)] = field(default_factory=list)
+    """First and last steps to skip, in pairs, instead of looking at the clock."""
+
+    def __post_init__(self) -> None:
+        pairs = list(zip(self.skip[::2], self.skip[1::2], strict=False))
+        ordered = all(first <= last for first, last in pairs) and self.skip == sorted(self.skip)
+        if len(self.skip) % 2 or not ordered:
+            raise ValueError(f"training.deadline.skip is {self.skip}: give rising pairs, [FIRST,LAST,FIRST,LAST,...]")
+        if self.seconds and (not self.planned or min(self.planned) <= 0 or self.planned != sorted(self.planned)):
+            raise ValueError(
+                f"training.deadline.planned is {self.planned}: give rising seconds, as minutes=N sets them, "
+                "or training.deadline.seconds=0"
+            )
+
+
+class Deadline(TrainingModule):
+    """A limit of training time."""
+
+    options: DeadlineOptions
+
+    def __init__(self, options: DeadlineOptions, context: ModuleContext) -> None:
+        super().__init__(options, context)
+        self.active = options.seconds > 0 and options.steps == context.iterations and not options.skip
+        """True: the clock may skip steps."""
+        self.last_stretch = round(options.to * context.iterations)
+        """First step of the last stretch."""
+        self.ranges = [range(a, b + 1) for a, b in zip(options.skip[::2], options.skip[1::2], strict=True)]
+        """Steps skipped so far, or to skip."""
+        self.since: tuple[int, float] | None = None
+        """Step and seconds of training since which the pace of the last stretch is measured."""
+
+    @property
+    def skipped(self) -> Sequence[int]:  # type: ignore[override]
+        """Skipped steps."""
+        return [step for steps in self.ranges for step in steps]
+
+    # -- hooks ---------------------------------------------------------------------------------------------------------
+
+    def before_step(self, run: Run) -> dict[str, float]:
+        """Skips steps if the run is late, or as `skip` lists them."""
+        first = run.step + 1
+        last = self.last_late(run) if self.active else self.last_listed(first)
+        if last < first:
+            return {}
+        if self.active:
+            self.ranges.append(range(first, last + 1))
+            logger.info(
+                "step %d: %.0f s of %.0f s used, skipping to step %d",
+                *(run.step, run.progress.seconds, self.options.seconds, last + 1),
+            )
+        run.step, self.since = last, None
+        return {"steps_left_out": last + 1 - first, "late_from": first, "late_to": last}
+
+    def supports(self, ranks: int) -> bool:
+        """Returns whether each process would skip the same steps."""
+        return not self.active or ranks == 1
+
+    def state_dict(self) -> Mapping[str, Tensor]:
+        """Returns the steps that were skipped by the clock."""
+        numbers = [[steps.start, steps.stop] for steps in self.ranges]
+        return {"skipped": torch.tensor(numbers)} if numbers and self.active else {}
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restores a checkpoint."""
+        if tensors:
+            self.ranges = [range(start, stop) for start, stop in tensors["skipped"].tolist()]
+
+    def plan(self, run: Run) -> dict[str, Any]:
+        """Returns the deadline and the steps that may be skipped."""
+        if not self.active:
+            return {}
+        may = {"may_skip_from": self.first_allowed(run, self.last_stretch), "to": self.last_stretch}
+        return {"deadline": {"seconds": self.options.seconds} | may}
+
+    @classmethod
+    def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Returns the steps that were skipped, as `skip` lists them."""
+        late = [number for line in lines if "late_from" in line for number in (line["late_from"], line["late_to"])]
+        return {"late": late} if late else {}
+
+    @classmethod
+    def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
+        """Yields how to repeat a run that skipped steps."""
+        if late := evaluation.get("late"):
+            skip = ",".join(f"{round(step)}" for step in late)
+            yield f"training fell behind its plan: it skipped steps; repeat it with training.deadline.skip=[{skip}]"
+
+    # -- rules ---------------------------------------------------------------------------------------------------------
+
+    def last_listed(self, first: int) -> int:
+        """Returns the last of the listed steps that begin here; 0: none do."""
+        return max((steps.stop - 1 for steps in self.ranges if steps.start == first), default=0)
+
+    def last_late(self, run: Run) -> int:
+        """Returns the last step to skip now; 0: the run is in time, or must act at a later milestone first."""
+        before_end = run.step < self.last_stretch - 1
+        if run.step < self.first_allowed(run, self.last_stretch if before_end else self.context.iterations):
+            return 0
+        return self.late_before_end(run) if before_end else self.late_at_end(run)
+
+    def first_allowed(self, run: Run, before: int) -> int:
+        """Returns the step after which others may be skipped: after all milestones before a step."""
+        return max(1, round(self.options.start * self.context.iterations), last_milestone(run, before))
+
+    def late_before_end(self, run: Run) -> int:
+        """Returns the last step before the last stretch if what is left is only enough for that stretch."""
+        used, options = run.progress.seconds, self.options
+        pace = used / self.planned_until(run.step)
+        needed = pace * (options.planned[-1] - self.planned_until(self.last_stretch))
+        return self.last_stretch - 1 if used + needed >= options.seconds else 0
+
+    def late_at_end(self, run: Run) -> int:
+        """Returns the last step to skip so that the rest of the last stretch ends in time."""
+        step, used = run.step, run.progress.seconds
+        self.since = self.since or (step, used)
+        if step < self.since[0] + MEASURED:
+            return 0
+        pace = (used - self.since[1]) / (self.planned_until(step) - self.planned_until(self.since[0]))
+        needed = pace * (self.options.planned[-1] - self.planned_until(step))
+        late = used + needed - self.options.seconds
+        if late <= SLACK * self.options.seconds:
+            return 0
+        left = self.context.iterations - step
+        return self.context.iterations - max(round(left * (1 - late / needed)), round(left * LEAST_END), 1)
+
+    def planned_until(self, step: int) -> float:
+        """Returns the planned seconds of the first steps."""
+        times = [0.0, *self.options.planned]
+        position = step / self.context.iterations * (len(times) - 1)
+        index = min(int(position), len(times) - 2)
+        return times[index] + (position - index) * (times[index + 1] - times[index])

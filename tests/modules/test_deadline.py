@@ -1,0 +1,137 @@
+"""Deadline: when steps are skipped and how many, by hand-worked times; repeated runs; resume."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from module_contexts import build_module
+from tiny import final_tensors, tiny_run
+
+from gsx.core.errors import ConfigError
+from gsx.modules.deadline import Deadline, DeadlineOptions
+
+PLANNED = [float(seconds) for seconds in range(10, 81, 10)] + [110.0, 140.0]
+"""Of 1,000 steps: 0.1 s for each of the first 800, 0.3 s for the others."""
+
+
+def deadline_of(seconds: float = 140.0, **options: Any) -> Deadline:
+    return build_module(Deadline, DeadlineOptions(seconds=seconds, steps=1000, planned=PLANNED, **options))
+
+
+def run_at(step: int, seconds: float, milestones: Sequence[int] = ()) -> Any:
+    """A run that has used so many seconds; another module acts once before each milestone."""
+    other = SimpleNamespace(milestones=lambda: list(milestones))
+    progress = SimpleNamespace(seconds=seconds)
+    return SimpleNamespace(step=step, progress=progress, backbone=None, modules={"other": other})
+
+
+def test_planned_seconds_between_shares() -> None:
+    deadline = deadline_of()
+    times = [deadline.planned_until(step) for step in (0, 50, 100, 800, 850, 900, 1000)]
+    assert times == pytest.approx([0, 5, 10, 80, 95, 110, 140])
+
+
+@pytest.mark.parametrize(
+    ("step", "seconds", "last"),
+    [
+        (600, 60.0, 0),  # as planned
+        (600, 69.0, 0),  # 1.15 times the plan: the last stretch takes 69 s, and 71 s are left
+        (600, 71.0, 799),  # 1.18 times: it takes 71 s, and 69 s are left
+        (400, 90.0, 0),  # late, but before half of the steps
+    ],
+)
+def test_steps_before_the_last_stretch(step: int, seconds: float, last: int) -> None:
+    run = run_at(step, seconds)
+    metrics = deadline_of().before_step(run)
+    assert run.step == (last or step)
+    assert metrics == ({"steps_left_out": last - step, "late_from": step + 1, "late_to": last} if last else {})
+
+
+def test_a_milestone_is_not_skipped() -> None:
+    deadline, run = deadline_of(), run_at(600, 90.0, milestones=[700])
+    assert deadline.before_step(run) == {} and run.step == 600
+    run = run_at(700, 100.0, milestones=[700])
+    assert deadline.before_step(run) and run.step == 799
+
+
+def test_the_last_stretch_shrinks_to_what_is_left() -> None:
+    """Measured from step 800 on: 0.5 s a step. After 8 steps 192 are left, 96 s, and 66 s for them: 132 steps."""
+    deadline = deadline_of()
+    assert deadline.before_step(run_at(800, 70.0)) == {}
+    run = run_at(808, 74.0)
+    metrics = deadline.before_step(run)
+    assert run.step == 1000 - 132 and metrics["late_from"] == 809
+
+
+def test_half_of_the_last_stretch_is_always_taken() -> None:
+    deadline = deadline_of()
+    deadline.before_step(run_at(800, 130.0))
+    run = run_at(810, 139.0)
+    deadline.before_step(run)
+    assert run.step == 1000 - 95
+
+
+def test_a_run_of_another_length_has_no_deadline() -> None:
+    longer = build_module(Deadline, DeadlineOptions(seconds=140.0, steps=1000, planned=PLANNED), iterations=2000)
+    assert longer.before_step(run_at(1500, 900.0)) == {}
+
+
+def test_no_deadline_skips_nothing() -> None:
+    assert build_module(Deadline, DeadlineOptions()).before_step(run_at(900, 1e9)) == {}
+
+
+@pytest.mark.parametrize("skip", [[5], [9, 5], [1, 5, 4, 8]])
+def test_lists_that_are_no_rising_pairs(skip: list[int]) -> None:
+    with pytest.raises(ValueError, match=r"training\.deadline\.skip is"):
+        DeadlineOptions(skip=skip)
+
+
+@pytest.mark.parametrize("planned", [[], [3.0, 2.0], [0.0, 1.0]])
+def test_a_deadline_needs_a_plan(planned: list[float]) -> None:
+    with pytest.raises(ValueError, match=r"training\.deadline\.planned is"):
+        DeadlineOptions(seconds=1.0, steps=2, planned=planned)
+
+
+def test_state_survives_a_checkpoint() -> None:
+    deadline = deadline_of()
+    deadline.before_step(run_at(600, 100.0))
+    restored = deadline_of()
+    restored.load_state_dict(deadline.state_dict())
+    assert list(restored.skipped) == list(range(601, 800))
+
+
+LATE = (
+    "iterations=20",
+    "training.log_every=1",
+    "backbone.density.stop=3000",
+    "training.deadline.seconds=0.000001",
+    "training.deadline.steps=20",
+    "training.deadline.planned=[0.0000005,0.000001]",
+)
+"""Late from the beginning, whatever the machine: all is skipped that may be."""
+
+
+def test_a_late_run_ends_its_schedule_and_can_be_repeated(tmp_path: Path) -> None:
+    run = tiny_run(tmp_path / "late", LATE)
+    lines = [json.loads(line) for line in (run.folder / "metrics.jsonl").read_text().splitlines()]
+    steps, late = [line["step"] for line in lines], json.loads((run.folder / "evaluation.json").read_text())["late"]
+    assert steps[:10] == list(range(1, 11)) and steps[-1] == 20 and len(steps) < 20
+    skip = ",".join(f"{round(step)}" for step in late)
+    again = tiny_run(tmp_path / "again", [*LATE[:3], f"training.deadline.skip=[{skip}]"])
+    one, other = final_tensors(run.folder), final_tensors(again.folder)
+    model = [name for name in one if "deadline" not in name]
+    assert model and all(torch.equal(one[name], other[name]) for name in model)
+
+
+def test_processes_that_train_together_have_no_clock() -> None:
+    assert not deadline_of().supports(2) and deadline_of().supports(1)
+    assert build_module(Deadline, DeadlineOptions()).supports(2)
+
+
+def test_wrong_lists_are_refused_before_a_run(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"training\.deadline\.skip"):
+        tiny_run(tmp_path / "run", ["training.deadline.skip=[3]"])
