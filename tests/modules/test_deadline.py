@@ -53,9 +53,11 @@ def test_steps_before_the_last_stretch(step: int, seconds: float, last: int) -> 
 
 def test_a_milestone_is_not_skipped() -> None:
     deadline, run = deadline_of(), run_at(600, 90.0, milestones=[700])
-    assert deadline.before_step(run) == {} and run.step == 600
+    assert deadline.before_step(run) == {}
+    assert run.step == 600
     run = run_at(700, 100.0, milestones=[700])
-    assert deadline.before_step(run) and run.step == 799
+    assert deadline.before_step(run)
+    assert run.step == 799
 
 
 def test_the_last_stretch_shrinks_to_what_is_left() -> None:
@@ -64,7 +66,8 @@ def test_the_last_stretch_shrinks_to_what_is_left() -> None:
     assert deadline.before_step(run_at(800, 70.0)) == {}
     run = run_at(808, 74.0)
     metrics = deadline.before_step(run)
-    assert run.step == 1000 - 132 and metrics["late_from"] == 809
+    assert run.step == 1000 - 132
+    assert metrics["late_from"] == 809
 
 
 def test_half_of_the_last_stretch_is_always_taken() -> None:
@@ -119,16 +122,20 @@ def test_a_late_run_ends_its_schedule_and_can_be_repeated(tmp_path: Path) -> Non
     run = tiny_run(tmp_path / "late", LATE)
     lines = [json.loads(line) for line in (run.folder / "metrics.jsonl").read_text().splitlines()]
     steps, late = [line["step"] for line in lines], json.loads((run.folder / "evaluation.json").read_text())["late"]
-    assert steps[:10] == list(range(1, 11)) and steps[-1] == 20 and len(steps) < 20
+    assert steps[:10] == list(range(1, 11))
+    assert steps[-1] == 20
+    assert len(steps) < 20
     skip = ",".join(f"{round(step)}" for step in late)
     again = tiny_run(tmp_path / "again", [*LATE[:3], f"training.deadline.skip=[{skip}]"])
     one, other = final_tensors(run.folder), final_tensors(again.folder)
     model = [name for name in one if "deadline" not in name]
-    assert model and all(torch.equal(one[name], other[name]) for name in model)
+    assert model
+    assert all(torch.equal(one[name], other[name]) for name in model)
 
 
 def test_processes_that_train_together_have_no_clock() -> None:
-    assert not deadline_of().supports(2) and deadline_of().supports(1)
+    assert not deadline_of().supports(2)
+    assert deadline_of().supports(1)
     assert build_module(Deadline, DeadlineOptions()).supports(2)
 
 

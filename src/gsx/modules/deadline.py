@@ -91,7 +91,8 @@ class Deadline(TrainingModule):
                 *(run.step, run.progress.seconds, self.options.seconds, last + 1),
             )
         run.step, self.since = last, None
-        return {"steps_left_out": last + 1 - first, "late_from": first, "late_to": last}
+        clocked = {"late_from": first, "late_to": last} if self.active else {}
+        return {"steps_left_out": last + 1 - first} | clocked
 
     def supports(self, ranks: int) -> bool:
         """Returns whether each process would skip the same steps."""

@@ -28,6 +28,8 @@ class Measurement:
     """Seconds to evaluate one test view at all zooms."""
     check: float
     """Seconds to render a test view at x1."""
+    path: str
+    """Path of the rasterizer that was measured."""
 
 
 @dataclass(frozen=True, kw_only=True)

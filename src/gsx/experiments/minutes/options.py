@@ -44,6 +44,8 @@ class PlanOptions:
     """Share of the time that is planned."""
     least_steps: int
     """Fewest steps of a run."""
+    enough_steps: int
+    """Steps below which photos are reduced further."""
     passes: float
     """Passes over the training views below which photos are reduced further."""
     least_pixels: float

@@ -1,4 +1,4 @@
-"""Plan of a run that ends after a given wall time: size, steps, growth and resolution over the steps."""
+"""Plan of a run that ends after a fixed wall time: size, steps, growth and resolution over the steps."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,6 +12,7 @@ from gsx.experiments.minutes.options import PlanOptions
 from gsx.experiments.runs.settings import Settings
 
 SIZE, CAPACITY, BUDGET = "scene.downscale", "backbone.capacity", "backbone.budget.primitives"
+PATH = "rasterizer.path"
 CHECKS, FINE_FROM = "training.test_points", "training.supersampling.start"
 MOST_DOWNSCALE = 64
 """Largest reduction of photos."""
@@ -24,7 +25,7 @@ class Task:
     """Run to plan."""
 
     settings: Settings
-    given: frozenset[str]
+    fixed: frozenset[str]
     """Keys whose values the plan keeps."""
     views: int
     """Training views."""
@@ -42,7 +43,7 @@ class Task:
         """Values of the settings by dotted key, with those of planned runs."""
         config = flattened(self.settings.resolved)
         planned = {key: value for key, value in self.options.schedule.items() if key in config}
-        return config | {key: value for key, value in planned.items() if key not in self.given}
+        return config | {key: value for key, value in planned.items() if key not in self.fixed}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +56,8 @@ class Plan:
     """Rows when growth ends."""
     planned: Sequence[float]
     """Seconds of training after equal shares of the steps."""
+    most: float
+    """Most seconds of training."""
     other: float
     """Seconds of photos, evaluation and report."""
 
@@ -71,10 +74,10 @@ def plan_run(task: Task) -> Plan:
         ConfigError: the time is not enough for the fewest steps.
     """
     options = task.options
-    enough = min(task.published, max(options.least_steps, math.ceil(options.passes * task.views)))
+    enough = min(task.published, max(options.enough_steps, math.ceil(options.passes * task.views)))
     plans = [plan_at(task, size) for size in sizes_of(task)]
     chosen = next((plan for plan in plans if plan.steps >= enough), plans[-1])
-    if chosen.seconds > task.seconds or chosen.steps < options.least_steps:
+    if chosen.seconds > task.seconds or chosen.steps < min(task.published, options.least_steps):
         raise ConfigError(too_short(task, chosen))
     return chosen
 
@@ -90,14 +93,14 @@ def too_short(task: Task, shortest: Plan) -> str:
 
 
 def sizes_of(task: Task) -> list[int]:
-    """Returns the reductions of photos to choose from, finest first; the present one alone if it is given."""
+    """Returns the reductions of photos to choose from, finest first; the present one alone if it is fixed."""
     measurement = task.measurement
-    if SIZE in task.given or SIZE not in task.values:
+    if SIZE in task.fixed or SIZE not in task.values:
         return [measurement.downscale]
     full = measurement.pixels * measurement.downscale**2
     sizes = [1 << power for power in range(MOST_DOWNSCALE.bit_length())]
     usable = [size for size in sizes if task.options.least_pixels <= full / size**2 <= task.options.most_pixels]
-    return usable or [measurement.downscale]
+    return usable or [1]
 
 
 def plan_at(task: Task, downscale: int) -> Plan:
@@ -116,6 +119,7 @@ def plan_at(task: Task, downscale: int) -> Plan:
         downscale=downscale,
         primitives=growth_of(task, downscale, low).last,
         planned=training_seconds(task, downscale, low),
+        most=left,
         other=other,
     )
 
@@ -150,12 +154,17 @@ def cost_of(task: Task) -> StepCost:
 def growth_of(task: Task, downscale: int, steps: int) -> Growth:
     """Returns the rows of the model over the run."""
     first, options, values = task.measurement.primitives, task.options, task.values
-    wanted = options.density * pixels_at(task, downscale) * math.sqrt(task.views)
-    last = min(wanted, first + options.most_growth * steps / 1000)
-    if values.get(CAPACITY) == "budget" and CAPACITY in task.given:
+    target = options.density * pixels_at(task, downscale) * math.sqrt(task.views) / rows_of(task)
+    last = min(target, first + options.most_growth * steps / 1000)
+    if values.get(CAPACITY) == "budget" and CAPACITY in task.fixed:
         last = values[BUDGET]
     start, stop = growth_window(task)
     return Growth(first=first, last=max(1, round(last)), start=start, stop=stop, power=0.5)
+
+
+def rows_of(task: Task) -> float:
+    """Returns the primitives that a row of the backbone's table costs."""
+    return task.options.cost.rows.get(task.settings.backbone.component.name, 1.0)
 
 
 def growth_window(task: Task) -> tuple[float, float]:
@@ -169,12 +178,12 @@ def growth_window(task: Task) -> tuple[float, float]:
 
 def changes_of(task: Task, plan: Plan) -> Mapping[str, Any]:
     """Returns the values by dotted key that make a planned run."""
-    values, given = task.values, task.given
-    changes: dict[str, Any] = {key: values[key] for key in task.options.schedule if key in values and key not in given}
-    changes["iterations"] = plan.steps
-    if SIZE in values and SIZE not in given:
+    values, fixed = task.values, task.fixed
+    changes: dict[str, Any] = {key: values[key] for key in task.options.schedule if key in values and key not in fixed}
+    changes |= {"iterations": plan.steps, PATH: task.measurement.path}
+    if SIZE in values and SIZE not in fixed:
         changes[SIZE] = plan.downscale
-    if values.get(CAPACITY) == "published" and CAPACITY not in given:
+    if values.get(CAPACITY) == "published" and CAPACITY not in fixed:
         changes |= {CAPACITY: "budget", BUDGET: plan.primitives}
     return changes | deadline_of(values, plan)
 
@@ -184,7 +193,7 @@ def deadline_of(values: Mapping[str, Any], plan: Plan) -> dict[str, Any]:
     fine = values.get("training.supersampling.factor", 1) > 1
     below = "training.deadline"
     return {
-        f"{below}.seconds": round(plan.planned[-1], 1),
+        f"{below}.seconds": round(max(plan.most, plan.planned[-1]), 1),
         f"{below}.steps": plan.steps,
         f"{below}.planned": [round(seconds, 2) for seconds in plan.planned],
         **({f"{below}.to": values[FINE_FROM]} if fine and values[FINE_FROM] >= LEAST_TO else {}),

@@ -12,10 +12,9 @@ from gsx.engine.processes import processes
 from gsx.experiments.minutes.options import PlanOptions, plan_options
 from gsx.experiments.minutes.overriding import overridden
 from gsx.experiments.minutes.plan import SIZE, Plan, Task, changes_of, plan_run
-from gsx.experiments.minutes.probe import measure
+from gsx.experiments.minutes.probe import LENGTH, measure
 from gsx.experiments.runs.build import choose_device
 from gsx.experiments.runs.load_scene import load_scene
-from gsx.experiments.runs.overrides import word_of
 from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -27,7 +26,7 @@ PUBLISHED = "length=published"
 """Word for the steps of the published run."""
 
 
-def given_keys(words: Iterable[str]) -> frozenset[str]:
+def keys_of(words: Iterable[str]) -> frozenset[str]:
     """Returns the keys that words of the command line set."""
     return frozenset(word.partition("=")[0].lstrip("+~") for word in words)
 
@@ -40,7 +39,7 @@ def with_default_time(words: Sequence[str], photos: bool) -> list[str]:
         photos: Whether the words train on somebody's photos: `gsx FOLDER`, or scene=photos.
     """
     kept = [word for word in words if word != PUBLISHED]
-    chosen = given_keys(words) & {*TIMES, *LENGTHS, "variant", "dataset", "init"}
+    chosen = keys_of(words) & {*TIMES, *LENGTHS, "variant", "dataset", "init"}
     if not photos or chosen or len(kept) < len(words) or processes() > 1 or not on_cpu(kept):
         return kept
     return [*kept, f"minutes={plan_options().default:g}"]
@@ -65,18 +64,18 @@ def planned(settings: Settings, words: Sequence[str], loaded: Plugins, started: 
         ConfigError: other words choose a length as well, or the time is not enough.
         InputError: the scene cannot be loaded.
     """
-    asked = 60 * settings.general.minutes or settings.general.seconds
-    if not asked:
+    limit = 60 * settings.general.minutes or settings.general.seconds
+    if not limit:
         return settings
-    started, given, options = time.monotonic() if started is None else started, given_keys(words), plan_options()
-    refuse(settings, given)
-    task = task_of(settings, given, asked, started, options, loaded)
+    started, fixed, options = time.monotonic() if started is None else started, keys_of(words), plan_options()
+    refuse(settings, fixed)
+    task = task_of(settings, fixed, limit, started, options, loaded)
     plan = plan_run(task)
     changes = {"minutes": 0.0, "seconds": 0.0, **changes_of(task, plan)}
     again = [word for word in words if word.partition("=")[0] not in TIMES]
-    again += [word_of(key, text_of(value)) for key, value in changes.items() if key not in TIMES and not of_clock(key)]
-    announce(task, plan, asked, time.monotonic() - started, again)
-    facts = {"asked_s": asked, "planned_s": round(time.monotonic() - started + plan.seconds, 1), "steps": plan.steps}
+    again += [f"{key}={text_of(value)}" for key, value in changes.items() if key not in TIMES and not of_clock(key)]
+    announce(task, plan, limit, time.monotonic() - started, again)
+    facts = {"limit_s": limit, "planned_s": round(time.monotonic() - started + plan.seconds, 1), "steps": plan.steps}
     return replace(overridden(settings, changes, loaded), repeat=tuple(again), time_plan=facts)
 
 
@@ -85,10 +84,10 @@ def of_clock(key: str) -> bool:
     return key.startswith("training.deadline.")
 
 
-def refuse(settings: Settings, given: frozenset[str]) -> None:
+def refuse(settings: Settings, fixed: frozenset[str]) -> None:
     """Raises ConfigError for words that minutes=N cannot be combined with."""
     name = "minutes" if settings.general.minutes else "seconds"
-    if both := sorted(given & set(LENGTHS)):
+    if both := sorted(fixed & set(LENGTHS)):
         raise ConfigError(f"{name}=N chooses the number of steps, and {both[0]} does, too: leave one of them out")
     if settings.general.reuse:
         raise ConfigError(
@@ -100,41 +99,41 @@ def refuse(settings: Settings, given: frozenset[str]) -> None:
 
 
 def task_of(
-    settings: Settings, given: frozenset[str], asked: float, started: float, options: PlanOptions, loaded: Plugins
+    settings: Settings, fixed: frozenset[str], limit: float, started: float, options: PlanOptions, loaded: Plugins
 ) -> Task:
     """Measures this machine on the scene and returns what is to be planned."""
-    downscale = probe_downscale(settings, given, options)
-    logger.info("measuring a few steps to plan %s ...", in_words(asked))
+    downscale = probe_downscale(settings, fixed, options)
+    logger.info("measuring a few steps to plan %s ...", in_words(limit))
     measurement, scene = measure(settings, downscale, options.probe, loaded)
     return Task(
         settings=settings,
-        given=given,
+        fixed=fixed,
         views=len(scene.train),
         tests=len(scene.test),
-        seconds=asked - (time.monotonic() - started),
-        published=settings.general.iterations,
+        seconds=limit - (time.monotonic() - started),
+        published=settings.resolved["backbone"].get("published_iterations", LENGTH),
         measurement=measurement,
         options=options,
     )
 
 
-def probe_downscale(settings: Settings, given: frozenset[str], options: PlanOptions) -> int:
-    """Returns the reduction of photos to measure at: the given one, else one of small pictures."""
+def probe_downscale(settings: Settings, fixed: frozenset[str], options: PlanOptions) -> int:
+    """Returns the reduction of photos to measure at: the fixed one, else one of small pictures."""
     present = getattr(settings.scene.options, "downscale", None)
-    if present is None or SIZE in given:
+    if present is None or SIZE in fixed:
         return present or 1
     camera = load_scene(settings).train[0].camera
     factor = math.sqrt(camera.width * camera.height / options.probe.pixels)
-    return max(2, 1 << math.ceil(math.log2(max(1.0, factor))))
+    return 1 << max(0, math.ceil(math.log2(factor)))
 
 
-def announce(task: Task, plan: Plan, asked: float, used: float, again: Sequence[str]) -> None:
+def announce(task: Task, plan: Plan, limit: float, used: float, again: Sequence[str]) -> None:
     """Logs the plan, what to choose instead, and the command for the same bits."""
     size = f" at 1/{plan.downscale} size" if plan.downscale > 1 else ""
     logger.info(
         "about %s: %s steps%s, up to %s primitives; minutes=%g for more, %s for %s steps",
         *(in_words(used + plan.seconds), f"{plan.steps:,}", size, f"{plan.primitives:,}"),
-        *(math.ceil(3 * asked / 60), PUBLISHED, f"{task.published:,}"),
+        *(math.ceil(3 * limit / 60), PUBLISHED, f"{task.published:,}"),
     )
     logger.info("the same training without a clock: %s", command(*again))
 

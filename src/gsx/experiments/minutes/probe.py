@@ -69,6 +69,7 @@ def measure(settings: Settings, downscale: int, options: ProbeOptions, loaded: P
         photo=photo,
         evaluate=evaluation_seconds(run, short),
         check=median_seconds(lambda view: render(run, view.camera), scene.test[:SAMPLES]),
+        path=run.raster.path,
     )
     return measurement, scene
 

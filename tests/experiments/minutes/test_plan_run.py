@@ -1,0 +1,109 @@
+"""Plans of runs by time, for made measurements: time kept, size chosen, values of the user kept."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from tiny import composed
+
+from gsx.core.errors import ConfigError
+from gsx.experiments.minutes.cost import Measurement
+from gsx.experiments.minutes.options import plan_options
+from gsx.experiments.minutes.plan import Task, changes_of, plan_run, training_seconds
+
+MEASURED = Measurement(
+    base=0.01,
+    megapixel=0.5,
+    pixels=30_000,
+    downscale=4,
+    primitives=5_000,
+    photo=0.02,
+    evaluate=0.3,
+    check=0.01,
+    path="compiled",
+)
+
+
+def task_of(seconds: float, *fixed: str, words: tuple[str, ...] = (), **changes: Any) -> Task:
+    return Task(
+        settings=composed("backbone=gs3d_zoom", *words),
+        fixed=frozenset(fixed),
+        views=40,
+        tests=6,
+        seconds=seconds,
+        published=30_000,
+        measurement=replace(MEASURED, **changes),
+        options=plan_options(),
+    )
+
+
+@pytest.mark.parametrize("seconds", [60.0, 300.0, 1800.0])
+def test_a_plan_uses_the_time(seconds: float) -> None:
+    task = task_of(seconds)
+    plan = plan_run(task)
+    most = seconds * task.options.used
+    assert plan.seconds <= most
+    assert plan.other + training_seconds(task, plan.downscale, plan.steps + 1)[-1] > most
+
+
+def test_more_time_brings_finer_photos_and_more_steps() -> None:
+    plans = [plan_run(task_of(seconds)) for seconds in (30.0, 120.0, 600.0, 3600.0)]
+    sizes = [plan.downscale for plan in plans]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[0] > sizes[-1]
+    assert all(plan.steps >= task_of(0).options.enough_steps for plan in plans[1:])
+
+
+def test_a_slower_machine_takes_fewer_steps() -> None:
+    fast, slow = (
+        plan_run(task_of(600.0, "scene.downscale", base=b, megapixel=m)) for b, m in ((0.01, 0.5), (0.03, 1.5))
+    )
+    assert 0.25 * fast.steps < slow.steps < 0.5 * fast.steps
+
+
+def test_no_plan_is_longer_than_the_published_run() -> None:
+    plan = plan_run(task_of(1e7))
+    assert plan.steps == 30_000
+    assert plan.downscale == 1
+    assert plan.seconds < 1e7
+
+
+def test_too_little_time_is_refused_with_what_it_takes() -> None:
+    with pytest.raises(
+        ConfigError, match=r"3 s are left .* 60 steps at 1/\d+ size take about \d+ s: give more minutes"
+    ):
+        plan_run(task_of(3.0))
+
+
+def test_values_of_the_command_line_stay() -> None:
+    task = task_of(600.0, "scene.downscale", "training.supersampling.start", "backbone.capacity")
+    plan = plan_run(task)
+    changes = changes_of(task, plan)
+    assert plan.downscale == 4
+    assert not {"scene.downscale", "training.supersampling.start", "backbone.capacity"} & changes.keys()
+
+
+def test_what_a_plan_changes() -> None:
+    task = task_of(600.0)
+    plan, schedule = plan_run(task), task.options.schedule
+    changes = changes_of(task, plan)
+    assert changes["iterations"] == plan.steps == changes["training.deadline.steps"]
+    assert changes["backbone.capacity"] == "budget"
+    assert changes["backbone.budget.primitives"] == plan.primitives
+    assert changes["rasterizer.path"] == "compiled"
+    assert changes["training.deadline.to"] == schedule["training.supersampling.start"]
+    assert changes["training.deadline.planned"][-1] == pytest.approx(plan.planned[-1], abs=0.01)
+
+
+def test_backbones_without_supersampling_have_no_finer_stretch() -> None:
+    task = replace(task_of(600.0), settings=composed())
+    assert "training.deadline.to" not in changes_of(task, plan_run(task))
+
+
+def test_anchors_cost_several_primitives() -> None:
+    anchors = replace(task_of(600.0), settings=composed("backbone=scaffold"))
+    free, rows = (
+        plan_run(task_of(600.0, "scene.downscale")),
+        plan_run(replace(anchors, fixed=frozenset(["scene.downscale"]))),
+    )
+    assert rows.primitives < free.primitives

@@ -1,0 +1,86 @@
+"""minutes=N from words to a trained run: measured, planned, repeated to the same bits; refused combinations."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from tiny import OVERRIDES, final_tensors
+
+from gsx.builtin import plugins
+from gsx.core.errors import ConfigError
+from gsx.experiments.minutes.planned import keys_of, planned, with_default_time
+from gsx.experiments.runs import job
+from gsx.experiments.runs.compose import compose
+
+WORDS = (*OVERRIDES, "backbone.published_iterations=12", "rasterizer=eager", "scene.points=120", "eval.zoom=[1]")
+"""However fast the machine, 12 steps are the most."""
+
+
+def test_a_planned_run_and_its_repetition(tmp_path: Path) -> None:
+    words, loaded = [*WORDS, "minutes=30", f"folder={tmp_path / 'planned'}"], plugins()
+    settings = planned(compose(words, loaded), words, loaded)
+    assert settings.general.iterations == 12
+    assert settings.general.minutes == 0
+    job.train(settings, loaded, [])
+    facts = json.loads((tmp_path / "planned" / "environment.json").read_text())["minutes"]
+    assert facts["limit_s"] == 1800
+    assert facts["steps"] == 12
+    assert 0 < facts["planned_s"] < 1800
+    late = json.loads((tmp_path / "planned" / "evaluation.json").read_text()).get("late", [])
+    again = [word for word in facts["repeat"] if not word.startswith("folder=")]
+    skip = [f"training.deadline.skip=[{','.join(str(round(step)) for step in late)}]"]
+    repeated = compose([*again, *skip, f"folder={tmp_path / 'repeated'}"], loaded)
+    job.train(repeated, loaded, [])
+    one, other = final_tensors(tmp_path / "planned"), final_tensors(tmp_path / "repeated")
+    model = [name for name in other if "deadline" not in name]
+    assert model
+    assert all(torch.equal(one[name], other[name]) for name in model)
+
+
+def test_settings_without_minutes_stay() -> None:
+    settings = compose(WORDS, loaded := plugins())
+    assert planned(settings, WORDS, loaded) is settings
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["minutes=5", "iterations=100"], "minutes=N chooses the number of steps, and iterations does, too"),
+        (["seconds=90", "budget=quick"], "seconds=N chooses the number of steps, and budget does, too"),
+        (["minutes=5", "reuse=true"], "reuse=true names the folder by the settings"),
+        (["minutes=5", "seconds=5"], "minutes is 5 and seconds 5: give one of them"),
+        (["minutes=-1"], "minutes is -1"),
+    ],
+)
+def test_what_minutes_cannot_be_combined_with(more: list[str], message: str) -> None:
+    words, loaded = [*WORDS, *more], plugins()
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        planned(compose(words, loaded), words, loaded)
+
+
+def test_too_few_seconds_are_refused(tmp_path: Path) -> None:
+    words, loaded = [*WORDS, "seconds=0.5", f"folder={tmp_path / 'run'}"], plugins()
+    with pytest.raises(ConfigError, match="give more minutes"):
+        planned(compose(words, loaded), words, loaded)
+    assert not (tmp_path / "run").exists()
+
+
+def test_keys_of_words() -> None:
+    assert keys_of(["a.b=1", "+c=2", "scene=demo"]) == {"a.b", "c", "scene"}
+
+
+@pytest.mark.parametrize(
+    ("words", "photos", "expected"),
+    [
+        (["device=cpu", "scene=photos"], True, ["device=cpu", "scene=photos", "minutes=10"]),
+        (["device=cpu"], False, ["device=cpu"]),
+        (["device=cpu", "length=published"], True, ["device=cpu"]),
+        (["device=cpu", "iterations=5"], True, ["device=cpu", "iterations=5"]),
+        (["device=cpu", "minutes=3"], True, ["device=cpu", "minutes=3"]),
+        (["device=cpu", "variant=mip_ub"], True, ["device=cpu", "variant=mip_ub"]),
+    ],
+)
+def test_photos_have_a_default_time_on_a_cpu(words: list[str], photos: bool, expected: list[str]) -> None:
+    assert with_default_time(words, photos) == expected
