@@ -18,7 +18,7 @@ from gsx.engine.cache import in_use
 from gsx.engine.processes import say, speaks
 from gsx.engine.signals import INTERRUPTED
 from gsx.experiments.minutes.clock import process_start
-from gsx.experiments.minutes.planned import planned, with_default_time
+from gsx.experiments.minutes.planned import planned, with_default_time, without_length
 from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.claims import claimed
 from gsx.experiments.run_folder.files import read_run, reported, state_of
@@ -39,11 +39,8 @@ from gsx.experiments.tables.sweep import is_table, run_table
 logger = logging.getLogger("gsx.cli")
 
 
-def train(words: list[str], photos: bool = False) -> int:
-    """Train one run, several (`-m`) or a table, or let Hydra print something, by the words of the command line.
-
-    photos: the scene is somebody's folder, for which a CPU has a default time.
-    """
+def train(words: list[str]) -> int:
+    """Train one run, several (`-m`) or a table, or let Hydra print something, by the words of the command line."""
     several = bool({"-m", "--multirun"} & set(words))
     if several:
         return train_several(words)
@@ -52,7 +49,7 @@ def train(words: list[str], photos: bool = False) -> int:
     if is_table(words):
         return fill_table(words)
     folders: list[Path] = []
-    words = with_default_time(words, photos=photos or "scene=photos" in words)
+    words = without_length(with_default_time(words) if "scene=photos" in words else words)
     settings = planned(compose(words, loaded := plugins()), words, loaded, process_start())
     code = job.train(settings, loaded, folders)
     return print_report(code, folders[0])
@@ -178,8 +175,9 @@ def train_folder(arguments: list[str]) -> int:
     scene = words[0].partition("=")[2]
     kind = "a video" if path.is_file() and scene == "photos" else f"read as scene={scene}"
     logger.info("%s is %s", path, kind)
-    logger.info("%s", command(*words, *overrides))
-    return train([*words, *overrides], photos=True)
+    words = with_default_time([*words, *overrides])
+    logger.info("%s", command(*words))
+    return train(words)
 
 
 def scene_words(path: Path, overrides: Sequence[str], loaded: Plugins) -> list[str]:

@@ -10,7 +10,7 @@ from tiny import OVERRIDES, final_tensors
 
 from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
-from gsx.experiments.minutes.planned import keys_of, planned, with_default_time
+from gsx.experiments.minutes.planned import keys_of, planned, with_default_time, without_length
 from gsx.experiments.runs import job
 from gsx.experiments.runs.compose import compose
 
@@ -71,16 +71,14 @@ def test_keys_of_words() -> None:
     assert keys_of(["a.b=1", "+c=2", "scene=demo"]) == {"a.b", "c", "scene"}
 
 
-@pytest.mark.parametrize(
-    ("words", "photos", "expected"),
-    [
-        (["device=cpu", "scene=photos"], True, ["device=cpu", "scene=photos", "minutes=10"]),
-        (["device=cpu"], False, ["device=cpu"]),
-        (["device=cpu", "length=published"], True, ["device=cpu"]),
-        (["device=cpu", "iterations=5"], True, ["device=cpu", "iterations=5"]),
-        (["device=cpu", "minutes=3"], True, ["device=cpu", "minutes=3"]),
-        (["device=cpu", "variant=mip_ub"], True, ["device=cpu", "variant=mip_ub"]),
-    ],
-)
-def test_photos_have_a_default_time_on_a_cpu(words: list[str], photos: bool, expected: list[str]) -> None:
-    assert with_default_time(words, photos) == expected
+@pytest.mark.parametrize("more", [[], ["backbone=gs3d"], ["scene.downscale=4"]])
+def test_photos_have_a_default_time_on_a_cpu(more: list[str]) -> None:
+    words = ["device=cpu", "scene=photos", *more]
+    assert with_default_time(words) == [*words, "minutes=10"]
+
+
+@pytest.mark.parametrize("word", ["length=published", "iterations=5", "minutes=3", "seconds=9", "variant=mip_ub"])
+def test_a_chosen_length_stays(word: str) -> None:
+    words = ["device=cpu", "scene=photos", word]
+    assert with_default_time(words) == words
+    assert without_length(words) == [one for one in words if one != "length=published"]

@@ -31,18 +31,17 @@ def keys_of(words: Iterable[str]) -> frozenset[str]:
     return frozenset(word.partition("=")[0].lstrip("+~") for word in words)
 
 
-def with_default_time(words: Sequence[str], photos: bool) -> list[str]:
-    """Returns words with the default minutes for photos on a CPU, unless they choose a length; without PUBLISHED.
-
-    Args:
-        words: Words of the command line.
-        photos: Whether the words train on somebody's photos: `gsx FOLDER`, or scene=photos.
-    """
-    kept = [word for word in words if word != PUBLISHED]
+def with_default_time(words: Sequence[str]) -> list[str]:
+    """Returns words that train on photos, with the default minutes on a CPU unless they choose a length."""
     chosen = keys_of(words) & {*TIMES, *LENGTHS, "variant", "dataset", "init"}
-    if not photos or chosen or len(kept) < len(words) or processes() > 1 or not on_cpu(kept):
-        return kept
-    return [*kept, f"minutes={plan_options().default:g}"]
+    if chosen or processes() > 1 or not on_cpu(words):
+        return list(words)
+    return [*words, f"minutes={plan_options().default:g}"]
+
+
+def without_length(words: Sequence[str]) -> list[str]:
+    """Returns words without PUBLISHED: nothing else is the length of the published run."""
+    return [word for word in words if word != PUBLISHED]
 
 
 def on_cpu(words: Iterable[str]) -> bool:
