@@ -2,6 +2,7 @@
 
 import logging
 import sys
+import time
 from argparse import Namespace
 from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stdout
@@ -32,7 +33,7 @@ from gsx.experiments.runs.multirun import check_overrides, hydra_main, job_overr
 from gsx.experiments.runs.open import open_run, refuse_other, stamped_folder
 from gsx.experiments.runs.overrides import quoted, with_quoted_paths, word_of
 from gsx.experiments.runs.saved_settings import write_config
-from gsx.experiments.runs.settings import settings_from
+from gsx.experiments.runs.settings import Settings, settings_from
 from gsx.experiments.runs.video import is_video, photos_of
 from gsx.experiments.tables.sweep import is_table, run_table
 
@@ -52,7 +53,15 @@ def train(words: list[str]) -> int:
     words = without_length(with_default_time(words) if "scene=photos" in words else words)
     settings = planned(compose(words, loaded := plugins()), words, loaded, process_start())
     code = job.train(settings, loaded, folders)
+    log_time(settings, code, time.monotonic() - process_start())
     return print_report(code, folders[0])
+
+
+def log_time(settings: Settings, code: int, seconds: float) -> None:
+    """Log how long a planned run took, if it has ended."""
+    if settings.time_plan and code == 0:
+        limit = settings.time_plan["limit_s"]
+        logger.info("took %.1f of %.1f minutes (%+.0f %%)", seconds / 60, limit / 60, 100 * (seconds / limit - 1))
 
 
 def print_report(code: int, *folders: Path) -> int:

@@ -41,9 +41,13 @@ class Task:
     @property
     def values(self) -> dict[str, Any]:
         """Values of the settings by dotted key, with those of planned runs."""
-        config = flattened(self.settings.resolved)
-        planned = {key: value for key, value in self.options.schedule.items() if key in config}
-        return config | {key: value for key, value in planned.items() if key not in self.fixed}
+        return flattened(self.settings.resolved) | schedule_of(self.settings, self.fixed, self.options)
+
+
+def schedule_of(settings: Settings, fixed: frozenset[str], options: PlanOptions) -> dict[str, Any]:
+    """Returns the values of planned runs by dotted key, of keys that the settings have and the user leaves open."""
+    config = flattened(settings.resolved)
+    return {key: value for key, value in options.schedule.items() if key in config and key not in fixed}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,7 +183,7 @@ def growth_window(task: Task) -> tuple[float, float]:
 def changes_of(task: Task, plan: Plan) -> Mapping[str, Any]:
     """Returns the values by dotted key that make a planned run."""
     values, fixed = task.values, task.fixed
-    changes: dict[str, Any] = {key: values[key] for key in task.options.schedule if key in values and key not in fixed}
+    changes = schedule_of(task.settings, fixed, task.options)
     changes |= {"iterations": plan.steps, PATH: task.measurement.path}
     if SIZE in values and SIZE not in fixed:
         changes[SIZE] = plan.downscale

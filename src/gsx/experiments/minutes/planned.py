@@ -11,7 +11,7 @@ from gsx.core.plugins import Plugins
 from gsx.engine.processes import processes
 from gsx.experiments.minutes.options import PlanOptions, plan_options
 from gsx.experiments.minutes.overriding import overridden
-from gsx.experiments.minutes.plan import SIZE, Plan, Task, changes_of, plan_run
+from gsx.experiments.minutes.plan import SIZE, Plan, Task, changes_of, plan_run, schedule_of
 from gsx.experiments.minutes.probe import LENGTH, measure
 from gsx.experiments.runs.build import choose_device
 from gsx.experiments.runs.load_scene import load_scene
@@ -103,7 +103,8 @@ def task_of(
     """Measures this machine on the scene and returns what is to be planned."""
     downscale = probe_downscale(settings, fixed, options)
     logger.info("measuring a few steps to plan %s ...", in_words(limit))
-    measurement, scene = measure(settings, downscale, options.probe, loaded)
+    changes = schedule_of(settings, fixed, options) | ({} if downscale is None else {SIZE: downscale})
+    measurement, scene = measure(settings, changes, options.probe, loaded)
     return Task(
         settings=settings,
         fixed=fixed,
@@ -116,11 +117,10 @@ def task_of(
     )
 
 
-def probe_downscale(settings: Settings, fixed: frozenset[str], options: PlanOptions) -> int:
-    """Returns the reduction of photos to measure at: the fixed one, else one of small pictures."""
-    present = getattr(settings.scene.options, "downscale", None)
-    if present is None or SIZE in fixed:
-        return present or 1
+def probe_downscale(settings: Settings, fixed: frozenset[str], options: PlanOptions) -> int | None:
+    """Returns the reduction of photos to measure at, which are small pictures; None: as the settings have it."""
+    if not hasattr(settings.scene.options, "downscale") or SIZE in fixed:
+        return None
     camera = load_scene(settings).train[0].camera
     factor = math.sqrt(camera.width * camera.height / options.probe.pixels)
     return 1 << max(0, math.ceil(math.log2(factor)))

@@ -3,11 +3,12 @@
 import logging
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from gsx.core.data.scene import Scene, View
 from gsx.core.plugins import Plugins, load_plugins
@@ -46,10 +47,18 @@ def quiet() -> Iterator[None]:
         logging.disable(logging.NOTSET)
 
 
-def measure(settings: Settings, downscale: int, options: ProbeOptions, loaded: Plugins) -> tuple[Measurement, Scene]:
-    """Trains a few steps of a run that is thrown away; returns seconds, and the scene at the measured size."""
-    short = overridden(settings, probe_changes(settings, downscale, options), loaded)
-    short = replace(short, augmenters={})
+def measure(
+    settings: Settings, changes: Mapping[str, Any], options: ProbeOptions, loaded: Plugins
+) -> tuple[Measurement, Scene]:
+    """Trains a few steps of a run that is thrown away; returns seconds, and the scene at the measured size.
+
+    Args:
+        settings: Settings of the run to plan.
+        changes: Values by dotted key that the measured run has as well.
+        options: Extent of the measurement.
+        loaded: Plugins.
+    """
+    short = replace(overridden(settings, dict(changes) | probe_changes(options), loaded), augmenters={})
     with quiet():
         scene = load_scene(short)
         run = build(short, replace(scene, train=evenly(scene.train, options.steps)), Path(), training=True)
@@ -64,7 +73,7 @@ def measure(settings: Settings, downscale: int, options: ProbeOptions, loaded: P
         base=max(0.0, large - megapixel * pixels / MILLION),
         megapixel=megapixel,
         pixels=pixels,
-        downscale=downscale,
+        downscale=getattr(short.scene.options, "downscale", 1),
         primitives=len(run.backbone.table),
         photo=photo,
         evaluate=evaluation_seconds(run, short),
@@ -74,14 +83,11 @@ def measure(settings: Settings, downscale: int, options: ProbeOptions, loaded: P
     return measurement, scene
 
 
-def probe_changes(settings: Settings, downscale: int, options: ProbeOptions) -> dict[str, object]:
+def probe_changes(options: ProbeOptions) -> dict[str, Any]:
     """Returns the options of the measured run by dotted key: coarse views first, then the photos' size."""
     until = (options.warm + options.steps) / LENGTH
-    changes: dict[str, object] = {"iterations": LENGTH}
-    changes |= {"training.coarse_to_fine.factor": COARSE, "training.coarse_to_fine.until": until}
-    if hasattr(settings.scene.options, "downscale"):
-        changes["scene.downscale"] = downscale
-    return changes
+    coarse = {"training.coarse_to_fine.factor": COARSE, "training.coarse_to_fine.until": until}
+    return {"iterations": LENGTH, **coarse}
 
 
 def median_step(run: Run, options: ProbeOptions) -> float:
