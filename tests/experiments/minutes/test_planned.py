@@ -27,7 +27,8 @@ def test_a_planned_run_and_its_repetition(tmp_path: Path) -> None:
     facts = json.loads((tmp_path / "planned" / "environment.json").read_text())["minutes"]
     assert facts["limit_s"] == 1800
     assert facts["steps"] == 12
-    assert 0 < facts["planned_s"] < 1800
+    assert 0 < facts["training_s"] < 1800
+    assert facts["measurement"]["primitives"] <= 120
     late = json.loads((tmp_path / "planned" / "evaluation.json").read_text()).get("late", [])
     again = [word for word in facts["repeat"] if not word.startswith("folder=")]
     skip = [f"training.deadline.skip=[{','.join(str(round(step)) for step in late)}]"]

@@ -4,7 +4,8 @@ import logging
 import math
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
+from typing import Any
 
 from gsx.core.errors import ConfigError, command
 from gsx.core.plugins import Plugins
@@ -74,8 +75,21 @@ def planned(settings: Settings, words: Sequence[str], loaded: Plugins, started: 
     again = [word for word in words if word.partition("=")[0] not in TIMES]
     again += [f"{key}={text_of(value)}" for key, value in changes.items() if key not in TIMES and not of_clock(key)]
     announce(task, plan, limit, time.monotonic() - started, again)
-    facts = {"limit_s": limit, "planned_s": round(time.monotonic() - started + plan.seconds, 1), "steps": plan.steps}
+    facts = facts_of(task, plan, limit, time.monotonic() - started)
     return replace(overridden(settings, changes, loaded), repeat=tuple(again), time_plan=facts)
+
+
+def facts_of(task: Task, plan: Plan, limit: float, used: float) -> dict[str, Any]:
+    """Returns what environment.json says of a plan; `used`: seconds before it."""
+    return {
+        "limit_s": limit,
+        "before_s": round(used, 1),
+        "training_s": round(plan.planned[-1], 1),
+        "other_s": round(plan.other, 1),
+        "steps": plan.steps,
+        "downscale": plan.downscale,
+        "measurement": asdict(task.measurement),
+    }
 
 
 def of_clock(key: str) -> bool:
