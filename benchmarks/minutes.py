@@ -129,7 +129,7 @@ def read_json_of(folder: Path) -> Mapping[str, Any]:
     from omegaconf import OmegaConf
 
     config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
-    return config  # type: ignore[no-any-return]
+    return config
 
 
 def pixels_of(folder: Path) -> float:

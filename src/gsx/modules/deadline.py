@@ -66,47 +66,44 @@ class Deadline(TrainingModule):
         """True: the clock may skip steps."""
         self.last_stretch = round(options.to * context.iterations)
         """First step of the last stretch."""
-        self.ranges = [range(a, b + 1) for a, b in zip(options.skip[::2], options.skip[1::2], strict=True)]
-        """Steps skipped so far, or to skip."""
+        self.listed = dict(zip(options.skip[::2], options.skip[1::2], strict=True))
+        """Last step of each stretch to skip by its first one."""
+        self.skipped: list[int] = []
+        """Steps skipped so far."""
         self.since: tuple[int, float] | None = None
         """Step and seconds of training since which the pace of the last stretch is measured."""
-
-    @property
-    def skipped(self) -> Sequence[int]:  # type: ignore[override]
-        """Skipped steps."""
-        return [step for steps in self.ranges for step in steps]
 
     # -- hooks ---------------------------------------------------------------------------------------------------------
 
     def before_step(self, run: Run) -> dict[str, float]:
         """Skips steps if the run is late, or as `skip` lists them."""
         first = run.step + 1
-        last = self.last_late(run) if self.active else self.last_listed(first)
+        last = self.last_late(run) if self.active else self.listed.get(first, 0)
         if last < first:
             return {}
-        if self.active:
-            self.ranges.append(range(first, last + 1))
-            logger.info(
-                "step %d: %.0f s of %.0f s used, skipping to step %d",
-                *(run.step, run.progress.seconds, self.options.seconds, last + 1),
-            )
+        self.skipped += range(first, last + 1)
+        clocked = self.log_late(run, first, last) if self.active else {}
         run.step, self.since = last, None
-        clocked = {"late_from": first, "late_to": last} if self.active else {}
-        return {"steps_left_out": last + 1 - first} | clocked
+        return {"steps_left_out": float(last + 1 - first)} | clocked
+
+    def log_late(self, run: Run, first: int, last: int) -> dict[str, float]:
+        """Logs steps that are skipped because the run is late; returns their metrics."""
+        used, limit = run.progress.seconds, self.options.seconds
+        logger.info("step %d: %.0f s of %.0f s used, skipping to step %d", run.step, used, limit, last + 1)
+        return {"late_from": float(first), "late_to": float(last)}
 
     def supports(self, ranks: int) -> bool:
         """Returns whether each process would skip the same steps."""
         return not self.active or ranks == 1
 
     def state_dict(self) -> Mapping[str, Tensor]:
-        """Returns the steps that were skipped by the clock."""
-        numbers = [[steps.start, steps.stop] for steps in self.ranges]
-        return {"skipped": torch.tensor(numbers)} if numbers and self.active else {}
+        """Returns the steps skipped by the clock."""
+        return {"skipped": torch.tensor(self.skipped)} if self.skipped and self.active else {}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Restores a checkpoint."""
         if tensors:
-            self.ranges = [range(start, stop) for start, stop in tensors["skipped"].tolist()]
+            self.skipped = tensors["skipped"].tolist()
 
     def plan(self, run: Run) -> dict[str, Any]:
         """Returns the deadline and the steps that may be skipped."""
@@ -129,10 +126,6 @@ class Deadline(TrainingModule):
             yield f"training fell behind its plan: it skipped steps; repeat it with training.deadline.skip=[{skip}]"
 
     # -- rules ---------------------------------------------------------------------------------------------------------
-
-    def last_listed(self, first: int) -> int:
-        """Returns the last of the listed steps that begin here; 0: none do."""
-        return max((steps.stop - 1 for steps in self.ranges if steps.start == first), default=0)
 
     def last_late(self, run: Run) -> int:
         """Returns the last step to skip now; 0: the run is in time, or must act at a later milestone first."""

@@ -71,7 +71,7 @@ class Plateau(TrainingModule):
         """Squared error in each window at that step."""
         self.gains: Float[Tensor, "T 3"] = torch.zeros(0, 3, dtype=torch.float64)
         """Step, gain in dB per doubling of the steps, and its standard error, of each test."""
-        self.skipped = range(0)
+        self.skipped: range = range(0)
         """Skipped steps."""
 
     # -- when ----------------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ A plugin registers one by `registry.add("module", NAME, factory, options)`. The 
 default that changes nothing. A module must not draw from `run.generator`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -39,7 +39,7 @@ class TrainingModule:
 
     in_views: ClassVar[bool] = False
     """True: views passed on to another run contain the corrections, so `restarted` must not repeat them."""
-    skipped = range(0)
+    skipped: Container[int] = range(0)
     """Steps that the module skipped."""
 
     def __init__(self, options: Any, context: ModuleContext) -> None:

@@ -3,7 +3,7 @@
 import logging
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -101,7 +101,7 @@ def median_step(run: Run, options: ProbeOptions) -> float:
     return statistics.median(times[options.warm :])
 
 
-def median_seconds(use: Callable[[View], object], views: list[View]) -> float:
+def median_seconds(use: Callable[[View], object], views: Sequence[View]) -> float:
     """Returns the median seconds of a function of a view; 0 without views."""
     times = []
     for view in views:
