@@ -64,10 +64,13 @@ class EventSteps:
         return min(1.0, max(0.0, (step // self.every - self.start // self.every) / max(1, self.count())))
 
 
-def event_steps(schedule: Schedule, start: int, stop: int, every: int) -> EventSteps:
-    """Rescales published steps of density control, which ends with the run at the latest."""
+def event_steps(schedule: Schedule, start: int, stop: int, every: int, passes: float = 1.0) -> EventSteps:
+    """Rescales published steps of density control, which ends with the run at the latest.
+
+    passes: least passes over the training views between events of a shortened run.
+    """
     stop = min(schedule.step(stop), schedule.iterations + 1)
-    return EventSteps(schedule.step(start), stop, schedule.interval(every))
+    return EventSteps(schedule.step(start), stop, schedule.interval(every, passes))
 
 
 class Capacity:

@@ -39,7 +39,8 @@ class DensityControl:
         self.options, self.context = options.density, context
         self.extent, self.generator = context.scene.extent, context.generator
         self.schedule = context.schedule(options.published_iterations)
-        self.events = event_steps(self.schedule, self.options.start, self.options.stop, self.options.every)
+        steps = self.options.start, self.options.stop, self.options.every
+        self.events = event_steps(self.schedule, *steps, self.options.passes)
         self.capacity = capacity_of(options, context, self.events)
         self.reset_every = self.schedule.interval(self.options.reset_every, self.options.reset_passes)
         white = bool((context.scene.background == 1).all())

@@ -49,6 +49,8 @@ class Density:
     """Least passes over the views between opacity resets, in a shortened run."""
     white_reset: Steps
     """Step of the extra opacity reset on a white background."""
+    passes: Annotated[float, Range(0, 1e6)] = 1.0
+    """Least passes over the views between events, in a shortened run."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -55,7 +55,7 @@ class PlanOptions:
     density: float
     """Primitives at the end of growth per pixel of a training view and square root of the views."""
     most_growth: float
-    """Most primitives at the end of growth per thousand steps."""
+    """Most primitives that growth adds per thousand steps."""
     report: float
     """Seconds of export and report after evaluation."""
     probe: ProbeOptions

@@ -30,6 +30,8 @@ NO_DEADLINE = {"name": "deadline", "seconds": 0.0, "steps": 0, "planned": [], "s
 UNCHANGED = {
     "scene.model": "auto",
     "scene.distances": "even",
+    "backbone.density.passes": 1.0,
+    "backbone.clone_split.density.passes": 1.0,
     **{f"training.deadline.{key}": value for key, value in NO_DEADLINE.items()},
 }
 """Keys newer than the first digests, with their neutral values, which do not count."""
