@@ -34,7 +34,7 @@ class DeadlineOptions:
     """Seconds of training; 0: no deadline."""
     steps: Steps = 0
     """Steps of the planned run; a run of another length has no deadline."""
-    planned: list[float] = field(default_factory=list)
+    planned: Annotated[list[float], Range(0, 10**9)] = field(default_factory=list)
     """Planned seconds of training after equal shares of the steps, the last: all."""
     start: Share = 0.5
     """Share of the steps before any are skipped; later if a milestone is later."""

@@ -25,16 +25,17 @@ PICTURES = (".webp", ".png")
 """Suffixes of an unbundled SOG's pictures."""
 NOT_COMPARED = "eval.competitor"
 """Node that changes no figure of the model: two runs may differ in it."""
-NO_DEADLINE = {"name": "deadline", "seconds": 0.0, "steps": 0, "planned": [], "start": 0.5, "to": 0.8, "skip": []}
-"""Options of a run without a deadline."""
 UNCHANGED = {
     "scene.model": "auto",
     "scene.distances": "even",
     "backbone.density.passes": 1.0,
     "backbone.clone_split.density.passes": 1.0,
-    **{f"training.deadline.{key}": value for key, value in NO_DEADLINE.items()},
 }
 """Keys newer than the first digests, with their neutral values, which do not count."""
+WITHOUT_EFFECT = {
+    "training.deadline": {"seconds": 0.0, "steps": 0, "planned": [], "start": 0.5, "to": 0.8, "skip": []},
+}
+"""Nodes newer than the first digests, with values by which they change nothing and do not count."""
 
 
 def trained(config: dict[str, Any], idle: Collection[str]) -> dict[str, Any]:
@@ -46,8 +47,14 @@ def trained(config: dict[str, Any], idle: Collection[str]) -> dict[str, Any]:
 
 
 def unchanged(config: dict[str, Any]) -> list[str]:
-    """List the keys of a composition that have their value of UNCHANGED."""
-    return [key for key, value in flattened(config).items() if UNCHANGED.get(key, ...) == value]
+    """List the keys and nodes of a composition that have their values of UNCHANGED and WITHOUT_EFFECT."""
+    values = flattened(config)
+    nodes = [
+        key
+        for key, neutral in WITHOUT_EFFECT.items()
+        if all(values.get(f"{key}.{name}", ...) == value for name, value in neutral.items())
+    ]
+    return [*nodes, *(key for key, value in values.items() if UNCHANGED.get(key, ...) == value)]
 
 
 def axes_of(config: dict[str, Any]) -> dict[str, Any]:
