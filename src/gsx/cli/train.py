@@ -19,7 +19,7 @@ from gsx.engine.cache import in_use
 from gsx.engine.processes import say, speaks
 from gsx.engine.signals import INTERRUPTED
 from gsx.experiments.minutes.clock import process_start
-from gsx.experiments.minutes.planned import planned, with_default_time, without_length
+from gsx.experiments.minutes.planned import planned, refuse_resumed, with_default_time, without_length
 from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.claims import claimed
 from gsx.experiments.run_folder.files import read_run, reported, state_of
@@ -163,6 +163,7 @@ def resume(options: Namespace) -> int:
     """Continue a run and print its report; raise InputError if it is complete or past its iterations."""
     folder, loaded = options.run, plugins()
     refuse_other(folder)
+    refuse_resumed(options.overrides)
     with in_use(), claimed(folder) if speaks() else nullcontext():
         run, settings = open_run(folder, loaded, options.overrides, training=True, trusted=options.trust)
         if run.step > run.iterations:

@@ -10,7 +10,7 @@ from tiny import OVERRIDES, final_tensors
 
 from gsx.builtin import plugins
 from gsx.core.errors import ConfigError
-from gsx.experiments.minutes.planned import keys_of, planned, with_default_time, without_length
+from gsx.experiments.minutes.planned import keys_of, planned, refuse_resumed, with_default_time, without_length
 from gsx.experiments.runs import job
 from gsx.experiments.runs.compose import compose
 
@@ -66,6 +66,12 @@ def test_too_few_seconds_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="give more minutes"):
         planned(compose(words, loaded), words, loaded)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_exists_is_not_planned() -> None:
+    with pytest.raises(ConfigError, match="gsx resume: minutes plans new runs only; give iterations=N"):
+        refuse_resumed(["seed=1", "minutes=5"])
+    refuse_resumed(["iterations=5"])
 
 
 def test_keys_of_words() -> None:

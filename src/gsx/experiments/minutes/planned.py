@@ -92,6 +92,12 @@ def facts_of(task: Task, plan: Plan, limit: float, used: float) -> dict[str, Any
     }
 
 
+def refuse_resumed(words: Iterable[str]) -> None:
+    """Raises ConfigError for a wall time of a run that exists: it was planned, or not, when it began."""
+    if both := sorted(keys_of(words) & set(TIMES)):
+        raise ConfigError(f"gsx resume: {both[0]} plans new runs only; give iterations=N to train longer")
+
+
 def of_clock(key: str) -> bool:
     """Returns whether a key belongs to the deadline, which the repeated run does not need."""
     return key.startswith("training.deadline.")

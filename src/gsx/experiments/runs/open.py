@@ -45,7 +45,10 @@ from gsx.formats.suffixes import SUFFIXES, suffix_of
 
 logger = logging.getLogger(__name__)
 
-OF_TRAINING = ("iterations", "length", "seed", "init", "axes", "reuse", "warm_start_at", "output", "folder")
+OF_TRAINING = (
+    *("iterations", "length", "minutes", "seconds", "seed"),
+    *("init", "axes", "reuse", "warm_start_at", "output", "folder"),
+)
 """Keys that change how and where a run is trained, and no figure of a trained run."""
 
 

@@ -28,7 +28,10 @@ from gsx.scenes.points import GREY
 logger = logging.getLogger(__name__)
 Rows = TypeVar("Rows", Tensor, Sequence[Any])
 
-OWN_KEYS = ("backbone", "augmenter", "init", "iterations", "variant", "preset", "budget", "experiment")
+OWN_KEYS = (
+    *("backbone", "augmenter", "init", "iterations", "minutes", "seconds"),
+    *("variant", "preset", "budget", "experiment"),
+)
 """Keys that `gsx eval FILE` sets or that only training uses: they cannot be overridden."""
 BLENDS = (
     "its colours were converted from linear light to sRGB, in which gsx blends: figures differ from those of programs "
