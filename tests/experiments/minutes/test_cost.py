@@ -46,7 +46,16 @@ def test_seconds_of_a_schedule() -> None:
 def test_cost_of_a_step_by_a_measurement() -> None:
     """0.05 s without pixels at 10,000 rows, of which rows cost 10,000 x 0.4 s / 10^6 x 2 = 0.008 s."""
     measurement = Measurement(
-        base=0.05, megapixel=0.4, pixels=1e5, downscale=1, primitives=10_000, photo=0, evaluate=0, check=0, path="eager"
+        base=0.05,
+        megapixel=0.4,
+        pixels=1e5,
+        downscale=1,
+        primitives=10_000,
+        photo=0,
+        evaluate=0,
+        check=0,
+        path="eager",
+        device="cpu",
     )
     options = CostOptions(late=0.5, primitives=2.0, rows={"anchors": 3.0})
     cost = step_cost(measurement, options, "free")

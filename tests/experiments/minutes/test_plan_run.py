@@ -21,6 +21,7 @@ MEASURED = Measurement(
     evaluate=0.3,
     check=0.01,
     path="compiled",
+    device="cpu",
 )
 
 

@@ -30,6 +30,8 @@ class Measurement:
     """Seconds to render a test view at x1."""
     path: str
     """Path of the rasterizer that was measured."""
+    device: str
+    """Type of the device that was measured: cpu or cuda."""
 
 
 @dataclass(frozen=True, kw_only=True)

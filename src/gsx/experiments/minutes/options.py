@@ -35,6 +35,18 @@ class CostOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Costs:
+    """Cost models by type of device."""
+
+    cpu: CostOptions
+    cuda: CostOptions
+
+    def of(self, device: str) -> CostOptions:
+        """Returns the cost model of a device."""
+        return self.cuda if device == "cuda" else self.cpu
+
+
+@dataclass(frozen=True, kw_only=True)
 class PlanOptions:
     """Constants of a plan; values and sources in conf/minutes.yaml."""
 
@@ -59,7 +71,8 @@ class PlanOptions:
     report: float
     """Seconds of export and report after evaluation."""
     probe: ProbeOptions
-    cost: CostOptions
+    cost: Costs
+    """Cost model by type of device."""
     schedule: dict[str, Any] = field(default_factory=dict)
     """Values by dotted key."""
 

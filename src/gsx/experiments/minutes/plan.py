@@ -8,7 +8,7 @@ from typing import Any
 from gsx.core.errors import ConfigError
 from gsx.core.options import flattened
 from gsx.experiments.minutes.cost import Growth, Measurement, StepCost, planned_seconds, stages_of, step_cost
-from gsx.experiments.minutes.options import PlanOptions
+from gsx.experiments.minutes.options import CostOptions, PlanOptions
 from gsx.experiments.runs.settings import Settings
 
 SIZE, CAPACITY, BUDGET = "scene.downscale", "backbone.capacity", "backbone.budget.primitives"
@@ -150,9 +150,14 @@ def training_seconds(task: Task, downscale: int, steps: int) -> list[float]:
     return planned_seconds(cost_of(task), stages_of(*coarse, *fine), growth, pixels, steps)
 
 
+def cost_options(task: Task) -> CostOptions:
+    """Returns the cost model of the measured device."""
+    return task.options.cost.of(task.measurement.device)
+
+
 def cost_of(task: Task) -> StepCost:
     """Returns the cost of a step of the task's backbone."""
-    return step_cost(task.measurement, task.options.cost, task.settings.backbone.component.name)
+    return step_cost(task.measurement, cost_options(task), task.settings.backbone.component.name)
 
 
 def growth_of(task: Task, downscale: int, steps: int) -> Growth:
@@ -168,7 +173,7 @@ def growth_of(task: Task, downscale: int, steps: int) -> Growth:
 
 def rows_of(task: Task) -> float:
     """Returns the primitives that a row of the backbone's table costs."""
-    return task.options.cost.rows.get(task.settings.backbone.component.name, 1.0)
+    return cost_options(task).rows.get(task.settings.backbone.component.name, 1.0)
 
 
 def growth_window(task: Task) -> tuple[float, float]:

@@ -2,15 +2,16 @@
 
 import logging
 import statistics
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from gsx.core.data.scene import Scene, View
+from gsx.core.device import clock
 from gsx.core.plugins import Plugins, load_plugins
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -63,7 +64,7 @@ def measure(
         scene = load_scene(short)
         run = build(short, replace(scene, train=evenly(scene.train, options.steps)), Path(), training=True)
     warm(run)
-    photo = median_seconds(run.photos.of, run.scene.train)
+    photo = median_seconds(run, run.photos.of, run.scene.train)
     for view in run.views.at(1):
         run.photos.of(view)
     small, large = (median_step(run, options) for _ in range(COARSE))
@@ -77,8 +78,9 @@ def measure(
         primitives=len(run.backbone.table),
         photo=photo,
         evaluate=evaluation_seconds(run, short),
-        check=median_seconds(lambda view: render(run, view.camera), scene.test[:SAMPLES]),
+        check=median_seconds(run, lambda view: render(run, view.camera), scene.test[:SAMPLES]),
         path=run.raster.path,
+        device=run.device.type,
     )
     return measurement, scene
 
@@ -90,24 +92,23 @@ def probe_changes(options: ProbeOptions) -> dict[str, Any]:
     return {"iterations": LENGTH, **coarse}
 
 
+def seconds_of(run: Run, use: Callable[[], object]) -> float:
+    """Returns the seconds of a call until the run's device is idle."""
+    start = clock(run.device)
+    use()
+    return clock(run.device) - start
+
+
 def median_step(run: Run, options: ProbeOptions) -> float:
     """Returns the median seconds of some steps, after those that warm up."""
     silent = load_plugins([], points=[])
-    times = []
-    for _ in range(options.warm + options.steps):
-        start = time.perf_counter()
-        train_step(run, silent)
-        times.append(time.perf_counter() - start)
+    times = [seconds_of(run, partial(train_step, run, silent)) for _ in range(options.warm + options.steps)]
     return statistics.median(times[options.warm :])
 
 
-def median_seconds(use: Callable[[View], object], views: Sequence[View]) -> float:
+def median_seconds(run: Run, use: Callable[[View], object], views: Sequence[View]) -> float:
     """Returns the median seconds of a function of a view; 0 without views."""
-    times = []
-    for view in views:
-        start = time.perf_counter()
-        use(view)
-        times.append(time.perf_counter() - start)
+    times = [seconds_of(run, partial(use, view)) for view in views]
     return statistics.median(times) if times else 0.0
 
 
@@ -119,6 +120,4 @@ def evaluation_seconds(run: Run, settings: Settings) -> float:
         first = replace(run.scene, test=run.scene.test[:1])
         one = replace(run, views=replace(run.views, scene=first), folder=Path(folder))
         evaluator = Evaluator(one, settings.evaluation, competitor_of(one, settings))
-        start = time.perf_counter()
-        evaluator.evaluate(Pictures(one.folder, one.step))
-        return time.perf_counter() - start
+        return seconds_of(run, lambda: evaluator.evaluate(Pictures(one.folder, one.step)))
