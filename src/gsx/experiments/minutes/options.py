@@ -68,6 +68,8 @@ class PlanOptions:
     """Primitives at the end of growth per pixel of a training view and square root of the views."""
     most_growth: float
     """Most primitives that growth adds per thousand steps."""
+    events: int
+    """Events of density control that a short run has at least."""
     report: float
     """Seconds of export and report after evaluation."""
     probe: ProbeOptions

@@ -12,7 +12,7 @@ from gsx.experiments.minutes.options import CostOptions, PlanOptions
 from gsx.experiments.runs.settings import Settings
 
 SIZE, CAPACITY, BUDGET = "scene.downscale", "backbone.capacity", "backbone.budget.primitives"
-PATH = "rasterizer.path"
+PATH, PASSES = "rasterizer.path", "backbone.density.passes"
 CHECKS, FINE_FROM = "training.test_points", "training.supersampling.start"
 MOST_DOWNSCALE = 64
 """Largest reduction of photos."""
@@ -181,7 +181,8 @@ def growth_window(task: Task) -> tuple[float, float]:
     values = task.values
     for group in ("backbone.density", "backbone.growth"):
         if f"{group}.start" in values:
-            return values[f"{group}.start"] / task.published, min(1.0, values[f"{group}.stop"] / task.published)
+            start, stop = (min(1.0, values[f"{group}.{edge}"] / task.published) for edge in ("start", "stop"))
+            return min(start, stop), stop
     return 0.0, 0.5
 
 
@@ -194,7 +195,15 @@ def changes_of(task: Task, plan: Plan) -> Mapping[str, Any]:
         changes[SIZE] = plan.downscale
     if values.get(CAPACITY) == "published" and CAPACITY not in fixed:
         changes |= {CAPACITY: "budget", BUDGET: plan.primitives}
+    if PASSES in values and PASSES not in fixed:
+        changes[PASSES] = passes_of(task, plan)
     return changes | deadline_of(values, plan)
+
+
+def passes_of(task: Task, plan: Plan) -> float:
+    """Returns the passes over the training views between events of density control, at most one."""
+    start, stop = growth_window(task)
+    return min(1.0, round(plan.steps * (stop - start) / (task.options.events * task.views), 2))
 
 
 def deadline_of(values: Mapping[str, Any], plan: Plan) -> dict[str, Any]:
