@@ -111,8 +111,8 @@ def test_anchors_cost_several_primitives() -> None:
 
 
 def test_short_runs_have_events_within_a_pass_over_the_views() -> None:
-    """Growth from 500 to 15,000 of 30,000 steps: 0.4833 of the steps for 6 events."""
+    """Growth from 500 to 15,000 of 30,000 steps: 0.4833 of the steps for 8 events."""
     task = task_of(0.0)
     short, long = (replace(plan_run(task_of(600.0)), steps=steps) for steps in (200, 2000))
-    assert changes_of(task, short)["backbone.density.passes"] == pytest.approx(200 * 0.4833 / 6 / 40, abs=0.005)
+    assert changes_of(task, short)["backbone.density.passes"] == pytest.approx(200 * 0.4833 / 8 / 40, abs=0.005)
     assert changes_of(task, long)["backbone.density.passes"] == 1
