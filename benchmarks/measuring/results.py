@@ -18,6 +18,8 @@ Section = dict[str, Any]
 """title, columns ([key, heading] each), rows, notes; and when, how, of what and, in a file, on what it was measured."""
 PARTS = {"title", "columns", "rows", "notes", "date", "commit", "load", "command", "machine"}
 """Of a section in a file."""
+PICTURES = {"splats": "Time against pairs", "reached": "PSNR over seconds"}
+"""Titles of pictures by a section that comes with one."""
 COLOURS = {"eager": "#3366aa", "compiled": "#d2601a", "naive": "#888888", "gsplat": "#2a8a4a"}
 STYLE = (
     "svg{font:11px system-ui,sans-serif;background:#fff}.grid{stroke:#ddd}.axis{stroke:#666}"
@@ -102,8 +104,10 @@ def kept_as_it_is(path: Path, reason: str) -> InputError:
     return InputError(f"{path} {reason} and is left as it is: move it away, or choose another folder with --to")
 
 
-def write_results(folder: Path, name: str, machine: dict[str, Any], sections: dict[str, Section]) -> list[Path]:
-    """Write `name`.json, .md and, with a scaling section, .svg; returns what was written.
+def write_results(
+    folder: Path, name: str, machine: dict[str, Any], sections: dict[str, Section], picture: str = ""
+) -> list[Path]:
+    """Write `name`.json, .md and, with a `picture` or a scaling section, .svg; returns what was written.
 
     Each section keeps the machine that it was measured on; those of earlier runs stay, but for the ones given now.
 
@@ -114,12 +118,12 @@ def write_results(folder: Path, name: str, machine: dict[str, Any], sections: di
     new = {key: section | {"machine": machine} for key, section in sections.items()}
     merged = read_sections(folder / f"{name}.json") | new
     write_json(folder / f"{name}.json", {"sections": merged})
-    return [folder / f"{name}.json", *write_pages(folder, name, merged)]
+    return [folder / f"{name}.json", *write_pages(folder, name, merged, picture)]
 
 
-def write_pages(folder: Path, name: str, sections: dict[str, Section]) -> list[Path]:
-    """Write `name`.md and, with a scaling section, .svg."""
-    drawing = scaling_plot(sections.get("splats", {"rows": []})["rows"])
+def write_pages(folder: Path, name: str, sections: dict[str, Section], picture: str = "") -> list[Path]:
+    """Write `name`.md and, with a `picture` or a scaling section, .svg."""
+    drawing = picture or scaling_plot(sections.get("splats", {"rows": []})["rows"])
     if drawing:
         replace_file(folder / f"{name}.svg", drawing.encode())
     replace_file(folder / f"{name}.md", markdown(name, sections, bool(drawing)).encode())
@@ -131,7 +135,8 @@ def markdown(name: str, sections: dict[str, Section], drawn: bool) -> str:
     machines = [section["machine"] for section in sections.values()]
     common = {key: value for key, value in machines[0].items() if all(m.get(key) == value for m in machines)}
     facts = "\n".join(f"* {key}: {value}" for key, value in common.items())
-    picture = [f"![Time against pairs]({name}.svg)"] if drawn else []
+    title = next((title for section, title in PICTURES.items() if section in sections), "")
+    picture = [f"![{title}]({name}.svg)"] if drawn else []
     tables = [markdown_table(section) + own_facts(section["machine"], common) for section in sections.values()]
     return "\n\n".join([f"# {name.replace('_', ' ')}", facts, *picture, *tables]) + "\n"
 

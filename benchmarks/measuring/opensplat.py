@@ -1,0 +1,103 @@
+"""OpenSplat, another program that trains on a CPU: a scene in its form, and its runs."""
+
+import os
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsx.core.data.camera import Camera
+from gsx.core.data.images import write_image
+from gsx.core.data.scene import PointCloud, Scene, View
+from gsx.core.files import write_json
+
+IMAGES, MODEL = "images", "sparse/0"
+"""Folders of the photos and of the COLMAP model."""
+CENTRE = 0.01
+"""Distance of a principal point from the centre that OpenSplat's CPU projection may ignore, px."""
+
+
+def write_scene(scene: Scene, folder: Path) -> Path:
+    """Writes the training views of a scene with their points as a COLMAP scene; returns its folder.
+
+    Photos are the 8-bit pictures that gsx trains on, cameras are pinholes of their size. Test views are left out.
+
+    Raises:
+        ValueError: a principal point is off the centre, which OpenSplat ignores.
+    """
+    import pycolmap
+
+    for view in scene.train:
+        refuse_off_centre(view)
+    for part in (IMAGES, MODEL):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    model = pycolmap.Reconstruction()
+    for number, view in enumerate(scene.train, start=1):
+        image = pycolmap.Image(name=f"{number:04d}.png", camera_id=number, image_id=number)
+        write_image(folder / IMAGES / image.name, view.picture())
+        model.add_camera_with_trivial_rig(colmap_camera(view.camera, number))
+        model.add_image_with_trivial_frame(image, pose_of(view.camera, scene.origin))
+    add_points(model, scene.points, scene.origin)
+    model.write_binary(folder / MODEL)
+    return folder
+
+
+def refuse_off_centre(view: View) -> None:
+    """Raises ValueError if the principal point is off the centre of the picture."""
+    camera = view.camera
+    off = max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2))
+    if off > CENTRE:
+        raise ValueError(
+            f"the principal point of '{view.name}' is {off:.2f} px off the centre, which OpenSplat ignores: compare "
+            "on scene.principal_point=centred"
+        )
+
+
+def colmap_camera(camera: Camera, number: int) -> Any:
+    """Returns a pinhole camera of COLMAP."""
+    import pycolmap
+
+    params = [camera.fx, camera.fy, camera.cx, camera.cy]
+    return pycolmap.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=params, camera_id=number)
+
+
+def pose_of(camera: Camera, origin: Sequence[float]) -> Any:
+    """Returns the pose, camera from world, in the coordinates of the scene's files."""
+    import pycolmap
+
+    rotation = camera.rotation.double().numpy()
+    translation = camera.translation.double().numpy() - rotation @ np.asarray(origin)
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
+
+
+def add_points(model: Any, points: PointCloud, origin: Sequence[float]) -> None:
+    """Adds the initial points, without observations."""
+    import pycolmap
+
+    for place, colour in zip(points.positions.double().numpy(), points.colours.numpy(), strict=True):
+        model.add_point3D(place + np.asarray(origin), pycolmap.Track(), colour)
+
+
+def run_opensplat(
+    program: Path, scene: Path, to: Path, words: Sequence[str], environment: Mapping[str, str], log: Path
+) -> dict[str, float]:
+    """Trains by OpenSplat in a process of its own; returns its wall time and peak memory, kept next to the file.
+
+    Raises:
+        subprocess.CalledProcessError: it failed.
+    """
+    command = [str(program), str(scene), "--keep-crs", "--output", str(to), *words]
+    to.parent.mkdir(parents=True, exist_ok=True)
+    started = time.perf_counter()
+    with log.open("w") as stream:
+        process = subprocess.Popen(command, env=os.environ | environment, stdout=stream, stderr=subprocess.STDOUT)
+        _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode or not to.is_file():
+        raise subprocess.CalledProcessError(process.returncode, command)
+    facts = {"wall_seconds": time.perf_counter() - started, "peak_mb": usage.ru_maxrss * 1024 / 1e6}
+    write_json(to.with_suffix(".clock.json"), facts)
+    return facts
