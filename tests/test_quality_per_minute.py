@@ -253,7 +253,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         seconds = 10 + 0.1 * steps if "iterations" in values else 60 * float(values["minutes"])
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "seconds").write_text(str(seconds))
-        return {"step": steps, "peak_memory_mb": 300.0}
+        return {"step": steps, "peak_memory_mb": 300.0, "psnr": 29.004}
 
     def gsx(words: list[str], environment: dict[str, str], log: Path) -> None:
         made.append(words)
@@ -299,7 +299,7 @@ def test_arms_take_turns_and_finished_runs_are_not_repeated(
         *(("opensplat", 1, 55, 60), ("opensplat", 2, 115, 120)),
     ]
     assert rows[0].items() >= {"x1": 29.0, "x2": 28.0, "x4": 26.0, "primitives": 7, "peak_mb": 300.0}.items()
-    assert (rows[0]["revision"], rows[-1]["revision"]) == (benchmark.REVISION, "stand-in 1")
+    assert (rows[0]["revision"], rows[-1]["revision"]) == (benchmark.REVISION, "opensplat stand-in 1")
     assert "![PSNR over seconds](quality_per_minute_cpu.svg)" in (tmp_path / "quality_per_minute_cpu.md").read_text()
     assert (tmp_path / "quality_per_minute_cpu.svg").is_file()
     before = len(calls)
@@ -331,6 +331,13 @@ def test_a_run_that_fails_is_reported_and_left_out(
     )
     assert "now, demo, 1 minutes, seed 0 failed" in capsys.readouterr().err
     assert not (tmp_path / "quality_per_minute_cpu.json").exists()
+
+
+def test_an_evaluation_that_differs_from_the_run_s_own_is_refused() -> None:
+    benchmark.refuse_disagreement(29.004, {"x1": 29.0}, Path("run"))
+    benchmark.refuse_disagreement(None, {"x1": 29.0}, Path("run"))
+    with pytest.raises(ValueError, match=r"run has 29\.020 dB by its own evaluation, 29\.000 dB"):
+        benchmark.refuse_disagreement(29.02, {"x1": 29.0}, Path("run"))
 
 
 def test_captures_need_their_folder() -> None:
