@@ -31,12 +31,12 @@ from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
 from measuring.curves import Point, steps_for
 from measuring.machine import commit, describe_machine, first_line, shown_command, told_load
-from measuring.opensplat import run_opensplat, write_scene
+from measuring.opensplat import file_of, run_opensplat, write_scene
 from measuring.panels import panels
 from measuring.quality_tables import REACHED_ZOOMS, Row, curve_of, place_of, reached, runs_section
 from measuring.results import Section, read_sections, text_table, write_results
 from measuring.revisions import checked_out
-from measuring.runs import gsx, train, wall_seconds
+from measuring.runs import clock_of, gsx, train, wall_seconds
 from zoom import numbers, refuse_unknown, shared_arguments
 
 FILE, RUNS, REACHED = "quality_per_minute_cpu", "runs", "reached"
@@ -164,19 +164,18 @@ def run_arm(bench: Bench, arm: str, scene: str, name: str, steps: int, minutes: 
 
 def run_other(bench: Bench, arm: str, scene: str, folder: Path, steps: int) -> Row:
     """Trains by OpenSplat unless the run is there."""
-    file, facts = folder.with_suffix(".ply"), folder.with_suffix(".clock.json")
-    if not facts.is_file():
+    if not clock_of(folder).is_file():
         print(time.strftime("%H:%M"), folder.name, flush=True)
         words = opensplat_words(arm, steps)
         data, log = opensplat_scene(bench, scene), folder.with_name(f"{folder.name}.log")
-        run_opensplat(bench.options.opensplat, data, file, words, bench.environment(arm), log)
-    kept = read_json(facts)
+        run_opensplat(bench.options.opensplat, data, folder, words, bench.environment(arm), log)
+    kept = read_json(clock_of(folder))
     return {"seconds": kept["wall_seconds"], "peak_mb": kept["peak_mb"], "steps": steps}
 
 
 def evaluated(bench: Bench, arm: str, scene: str, folder: Path) -> Row:
     """Evaluates a model on the held-out views at every zoom, by the present revision."""
-    model = [str(folder.with_suffix(".ply")), *bench.scene_words(scene), f"folder={folder}"]
+    model = [str(file_of(folder)), *bench.scene_words(scene), f"folder={folder}"]
     words = model if arm in OTHERS else [str(folder)]
     gsx(["eval", *words, *EVALUATION], bench.environment(NOW), folder.with_name(f"{folder.name}.eval.log"))
     evaluation = read_json(folder / "evaluation.json")

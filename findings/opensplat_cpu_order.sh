@@ -22,16 +22,17 @@ from gsx.core.data.images import read_image
 from gsx.core.quality.metrics import psnr
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
-from measuring.opensplat import run_opensplat, write_scene
+from measuring.opensplat import file_of, run_opensplat, write_scene
 
 SCENE = "scene=demo scene.width=128 scene.height=96 scene.train_views=10 scene.test_views=2 scene.points=1500"
 BACKGROUND = (0.6130, 0.0101, 0.3984)  # OpenSplat's own, model.hpp
 WORDS = ["--num-iters", "10", "--num-downscales", "0", "--val-image", "0003.png", "--val-render"]
 folder, program = Path(sys.argv[1]), Path(sys.argv[2])
 scene = load_scene(compose([*SCENE.split(), "scene.samples=1"], plugins()))
-file, renders = folder / "model.ply", folder / "renders"
-run_opensplat(program, write_scene(scene, folder / "scene"), file, [*WORDS, str(renders)], {}, folder / "log.txt")
-render = gsx.load(file).render(scene.train[2], BACKGROUND).clamp(0, 1)
+renders = folder / "renders"
+place = folder / "model"
+run_opensplat(program, write_scene(scene, folder / "scene"), place, [*WORDS, str(renders)], {}, folder / "log.txt")
+render = gsx.load(file_of(place)).render(scene.train[2], BACKGROUND).clamp(0, 1)
 difference = psnr(render, read_image(renders / "10.png").float() / 255)
 print(f"OpenSplat's render against that of its file by gsx: {difference:.1f} dB")
 if difference > 40:

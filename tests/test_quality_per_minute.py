@@ -23,6 +23,7 @@ from measuring.opensplat import MODEL, run_opensplat, write_scene
 from measuring.panels import panels
 from measuring.quality_tables import reached
 from measuring.results import read_sections
+from measuring.runs import clock_of
 
 CURVE = [(60.0, 20.0), (240.0, 24.0), (600.0, 25.0)]
 
@@ -64,7 +65,7 @@ def test_steps_are_interpolated_between_runs_and_go_on_beyond_them() -> None:
     assert steps_for(30, [(100, 18.0), (100, 22.0), (300, 40.0)]) == 200  # two runs of one length: their mean
     with pytest.raises(ValueError, match="measure two lengths"):
         steps_for(30, [(100, 20.0), (100, 21.0)])
-    with pytest.raises(ValueError, match="100 steps lasted 50 s, and 300 steps 40 s"):
+    with pytest.raises(ValueError, match="100 steps lasted 50 s, but 300 steps lasted 40 s"):
         steps_for(45, [(100, 50.0), (300, 40.0)])
 
 
@@ -218,16 +219,16 @@ def program(tmp_path: Path) -> Path:
 
 
 def test_a_run_of_opensplat_is_timed_with_its_peak_memory(tmp_path: Path, program: Path) -> None:
-    to = tmp_path / "runs" / "model.ply"
-    log = tmp_path / "log.txt"
-    facts = run_opensplat(program, tmp_path, to, ["--num-iters", "7"], {}, log)
+    place, log = tmp_path / "runs" / "demo_0.5_minutes", tmp_path / "log.txt"
+    to = tmp_path / "runs" / "demo_0.5_minutes.ply"
+    facts = run_opensplat(program, tmp_path, place, ["--num-iters", "7"], {}, log)
     assert to.read_text() == f"{tmp_path} --keep-crs --output {to} --num-iters 7"
     assert 0 < facts["wall_seconds"] < 60
     assert 50 < facts["peak_mb"] < 500
-    assert json.loads(to.with_suffix(".clock.json").read_text()) == facts
+    assert json.loads(clock_of(place).read_text()) == facts
     with pytest.raises(Exception, match="non-zero exit status 3"):
-        run_opensplat(program, tmp_path, tmp_path / "other.ply", ["fail"], {}, log)
-    assert not (tmp_path / "other.clock.json").exists()
+        run_opensplat(program, tmp_path, tmp_path / "other", ["fail"], {}, log)
+    assert not clock_of(tmp_path / "other").exists()
 
 
 def test_schedules_of_opensplat_are_compressed_to_the_steps() -> None:
@@ -263,10 +264,10 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         zooms = {zoom: {"psnr": 30.0 - int(zoom)} for zoom in benchmark.ZOOMS}
         (folder / "evaluation.json").write_text(json.dumps({"zoom": zooms, "primitives": 7}))
 
-    def other(program: Path, scene: Path, to: Path, words: list[str], environment: object, log: Path) -> None:
+    def other(program: Path, scene: Path, place: Path, words: list[str], environment: object, log: Path) -> None:
         made.append(["opensplat", *words])
         facts = {"wall_seconds": 5 + int(words[1]), "peak_mb": 99.0}
-        to.with_suffix(".clock.json").write_text(json.dumps(facts))
+        clock_of(place).write_text(json.dumps(facts))
 
     for name, stand_in in {"train": train, "gsx": gsx, "run_opensplat": other}.items():
         monkeypatch.setattr(benchmark, name, stand_in)

@@ -62,5 +62,6 @@ def steps_for(seconds: float, runs: Sequence[Point]) -> int:
     swapped = [(fmean(lasted for steps, lasted in runs if steps == length), length) for length in lengths]
     one, other = neighbours(swapped, seconds)
     if other[0] <= one[0] or other[1] <= one[1]:
-        raise ValueError(f"{other[1]:.0f} steps lasted {other[0]:.0f} s, and {one[1]:.0f} steps {one[0]:.0f} s")
+        shorter, longer = (f"{steps:.0f} steps lasted {lasted:.0f} s" for lasted, steps in (other, one))
+        raise ValueError(f"{shorter}, but {longer}: remove these runs and measure them again")
     return max(1, round(line_at(one, other, seconds)))

@@ -13,6 +13,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.files import write_json
+from measuring.runs import clock_of
 
 IMAGES, MODEL = "images", "sparse/0"
 """Folders of the photos and of the COLMAP model."""
@@ -81,14 +82,20 @@ def add_points(model: Any, points: PointCloud, origin: Sequence[float]) -> None:
         model.add_point3D(place + np.asarray(origin), pycolmap.Track(), colour)
 
 
+def file_of(place: Path) -> Path:
+    """Returns the file with the splats of a run."""
+    return place.with_name(f"{place.name}.ply")
+
+
 def run_opensplat(
-    program: Path, scene: Path, to: Path, words: Sequence[str], environment: Mapping[str, str], log: Path
+    program: Path, scene: Path, place: Path, words: Sequence[str], environment: Mapping[str, str], log: Path
 ) -> dict[str, float]:
-    """Trains by OpenSplat in a process of its own; returns its wall time and peak memory, kept next to the file.
+    """Trains by OpenSplat in a process of its own; returns wall time and peak memory, kept next to `file_of(place)`.
 
     Raises:
         subprocess.CalledProcessError: it failed.
     """
+    to = file_of(place)
     command = [str(program), str(scene), "--keep-crs", "--output", str(to), *words]
     to.parent.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
@@ -99,5 +106,5 @@ def run_opensplat(
     if process.returncode or not to.is_file():
         raise subprocess.CalledProcessError(process.returncode, command)
     facts = {"wall_seconds": time.perf_counter() - started, "peak_mb": usage.ru_maxrss * 1024 / 1e6}
-    write_json(to.with_suffix(".clock.json"), facts)
+    write_json(clock_of(place), facts)
     return facts
