@@ -9,7 +9,8 @@ measured. Arms: `before` is the default of an older revision, in as many steps a
 were timed before. Wall times are those of whole processes, with photos, poses and compiled code in the cache. Every
 model is evaluated on the same held-out views by the present `gsx eval`, outside of its time. Runs in the results, and
 finished runs below --runs, are not repeated. Nothing else should run. Half an hour for a scene, an arm and a seed.
-OpenSplat 1.1.5 sorts Gaussians wrongly on a CPU (findings/opensplat_cpu_order.sh): give a program that is repaired.
+OpenSplat 1.1.5 sorts Gaussians by another number than depth on a CPU (rasterizer/gsplat-cpu/gsplat_cpu.cpp reads a
+column of a matrix as if it were contiguous): give a program that is repaired.
 """
 
 import argparse

@@ -43,7 +43,8 @@ def test_a_curve_goes_on_for_a_tenth_of_its_seconds_and_no_further() -> None:
     assert psnr_at(CURVE, 630) == pytest.approx(25 + slope * math.log(1.05))
     assert psnr_at(CURVE, 661) is None
     assert psnr_at(CURVE, 54) is None
-    assert psnr_at(CURVE[:1], 60) is None
+    assert psnr_at(CURVE[:1], 62) == 20
+    assert psnr_at(CURVE[:1], 70) is None
 
 
 def test_seconds_to_a_psnr_are_those_where_the_curve_first_has_it() -> None:

@@ -25,11 +25,13 @@ def neighbours(points: Sequence[Point], x: float) -> tuple[Point, Point]:
 def psnr_at(curve: Sequence[Point], seconds: float) -> float | None:
     """Returns the PSNR that a curve has after some seconds, linear in log(seconds).
 
-    None: the curve has one run alone, or ends more than `REACH` away.
+    None: the curve ends more than `REACH` away. A single run stands for seconds that near.
     """
     ordered = sorted(curve)
-    if len(ordered) < 2 or not ordered[0][0] / REACH <= seconds <= ordered[-1][0] * REACH:
+    if not ordered or not ordered[0][0] / REACH <= seconds <= ordered[-1][0] * REACH:
         return None
+    if len(ordered) == 1:
+        return ordered[0][1]
     one, other = neighbours(ordered, seconds)
     return line_at((math.log(one[0]), one[1]), (math.log(other[0]), other[1]), math.log(seconds))
 
