@@ -35,6 +35,9 @@ def test_a_planned_run_and_its_repetition(tmp_path: Path) -> None:
     repeated = compose([*again, *skip, f"folder={tmp_path / 'repeated'}"], loaded)
     job.train(repeated, loaded, [])
     one, other = final_tensors(tmp_path / "planned"), final_tensors(tmp_path / "repeated")
+    page = (tmp_path / "planned" / "report.html").read_text()
+    assert "Planned for 30.0 minutes: 12 steps" in page
+    assert "backbone.published_iterations=12" in page
     model = [name for name in other if "deadline" not in name]
     assert model
     assert all(torch.equal(one[name], other[name]) for name in model)

@@ -211,9 +211,9 @@ def deadline_of(values: Mapping[str, Any], plan: Plan) -> dict[str, Any]:
     fine = values.get("training.supersampling.factor", 1) > 1
     below = "training.deadline"
     return {
-        f"{below}.seconds": round(max(plan.most, plan.planned[-1]), 1),
+        f"{below}.seconds": float(f"{max(plan.most, plan.planned[-1]):.6g}"),
         f"{below}.steps": plan.steps,
-        f"{below}.planned": [round(seconds, 2) for seconds in plan.planned],
+        f"{below}.planned": [float(f"{seconds:.6g}") for seconds in plan.planned],
         **({f"{below}.to": values[FINE_FROM]} if fine and values[FINE_FROM] >= LEAST_TO else {}),
     }
 

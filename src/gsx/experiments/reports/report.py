@@ -14,7 +14,7 @@ from typing import Any
 from markupsafe import Markup
 
 from gsx import __version__
-from gsx.core.errors import InputError
+from gsx.core.errors import InputError, command
 from gsx.core.files import is_file, remove_partial, replace_text
 from gsx.experiments.evaluation.perceptual import COMPARED
 from gsx.experiments.evaluation.remarks import NOT_MEASURED, measures_nothing, remarks_of
@@ -108,6 +108,7 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "zoom_groups": zoom_groups(zoom),
         "scene": part(run.environment, "scene"),
         "plan": part(run.environment, "plan"),
+        "minutes": minutes_of(run),
         "remarks": remarks_of(evaluation),
         "unmeasured": f"{NOT_MEASURED[0].upper()}{NOT_MEASURED[1:]}." if measures_nothing(evaluation) else "",
         "zoom": zoom,
@@ -131,6 +132,15 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "ramp": ", ".join(f"rgb{colour} {place:.0%}" for place, colour in ERROR_COLOURS),
         "environment_text": json.dumps(run.environment, indent=2, ensure_ascii=False) if run.environment else "",
     }
+
+
+def minutes_of(run: RunFiles) -> dict[str, Any]:
+    """Returns the plan by wall time of a run with the command that repeats it; empty: there is no readable one."""
+    plan = part(run.environment, "minutes")
+    words, numbers = plan.get("repeat"), [plan.get(key) for key in ("limit_s", "steps", "training_s")]
+    if not (isinstance(words, list) and all(isinstance(word, str) for word in words) and all(map(is_number, numbers))):
+        return {}
+    return plan | {"command": command(*words)}
 
 
 def embedded(path: Path) -> str | None:
