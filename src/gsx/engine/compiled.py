@@ -24,6 +24,7 @@ from gsx.core.shapes import Float, Int
 from gsx.engine.backend import COMPILED
 from gsx.engine.compile_cache import recording
 from gsx.engine.compiling import available, complaint
+from gsx.engine.direct_calls import direct
 from gsx.engine.kernels import (
     TABLE,
     Rules,
@@ -186,7 +187,7 @@ def blend_stage(job: Job, loop: Callable[..., None], stage: Stage, accumulated: 
 
 def shares(job: Job, rows: Rows, like: Float[Tensor, "G P L"]) -> Float[Tensor, "G P L"]:
     """Returns the transmittance of each list that another piece follows, and of some others; 1 elsewhere."""
-    loop, passed = compiled_loop(transmit, job.rules), Rows(torch.ones_like(like))
+    loop, passed = direct(compiled_loop(transmit, job.rules)), Rows(torch.ones_like(like))
     followed = max(int(groups.max()) + 1 for _, (groups, _) in job.lanes.follows)  # the longest lists, hence first
     for part in parts(max(2, followed), job.batch):
         for base in job.lanes.bases:
@@ -228,7 +229,7 @@ def blend_chunks(
         passed = shares(job, held, inside)
         front, pieces = in_front(job.lanes, passed, inside), (passed, lights)
     kept = Chunks([], held, Rows(front), Rows(inside.new_empty(len(rows), *inside.shape[1:])), pieces)
-    loop = compiled_loop(blend, job.rules)
+    loop = direct(compiled_loop(blend, job.rules))
     for batch in parts(len(inside), job.batch):
         number, left = 0, None
         while (stage := stage_of(job, number, batch, left)) is not None:
@@ -257,7 +258,7 @@ def chunk_gradients(job: Job, kept: Chunks, gradient: list[Float[Tensor, "G P L"
     """Returns the gradient of every entry, back to front; zero for blocks that were not blended."""
     channels, behind, basis = [Rows(one) for one in gradient], Rows(behind_lists(job, kept, gradient)), job.basis
     found = Rows(room_for_gradients(kept, TABLE + job.rules.channels + 2 * job.rules.absolute))
-    loop = compiled_loop(gradients, job.rules)
+    loop = direct(compiled_loop(gradients, job.rules))
     for stage in reversed(kept.stages):
         rest, part = behind.take(stage.groups), found.take(stage.blocks)
         weights = [channel.take(stage.groups) for channel in channels]

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from gsx.core.errors import CompilerError, first_line
-from gsx.engine.compile_cache import CachedFunction, flat, record, recording
+from gsx.engine.compile_cache import CachedFunction, Code, flat, record, recording
 
 Result = TypeVar("Result")
 Varying: TypeAlias = Callable[[tuple[Any, ...]], list[tuple[Tensor, int]]]
@@ -87,7 +87,7 @@ def compiled_once(
     options: dict[str, Any] | None = None,
     unchecked: Iterable[str] = (),
     fullgraph: bool = False,
-) -> Callable[..., Any]:
+) -> "CompiledOnce":
     """Compiles `function` of tensors once, for all values of the sizes that vary.
 
     On a CPU its code is cached on disk (compile_cache.py); elsewhere torch traces it in each process.
@@ -106,18 +106,35 @@ def compiled_once(
     def traced() -> Callable[..., Any]:  # torch's compiler takes a second to import
         return sizes_free(torch.compile(function, fullgraph=fullgraph, options=chosen), varying)
 
-    def call(*arguments: Any) -> Any:
+    return CompiledOnce(cached, traced)
+
+
+class CompiledOnce:
+    """A function of tensors whose code is looked up at each call."""
+
+    def __init__(self, cached: CachedFunction, traced: Callable[[], Callable[..., Any]]) -> None:
+        self.cached, self.traced = cached, traced
+        self.direct: dict[Code, Callable[..., None]] = {}
+        """Calls without torch's layers (direct_calls.py)."""
+
+    def __call__(self, *arguments: Any) -> Any:
         if Parameter in map(type, arguments):  # torch always takes their sizes for constants
             arguments = tuple(a.view_as(a) if type(a) is Parameter else a for a in arguments)
-        if flat(arguments[:1])[0].is_cpu:
-            if record(cached, arguments):
-                return function(*arguments)
-            code = cached.code_for(arguments)
-            if code is not None:
-                return code.run(*arguments)
-        return by_torch(traced, function.__name__, arguments)
+        if on_cpu(arguments) and record(self.cached, arguments):
+            return self.cached.function(*arguments)
+        code = self.cached_code(arguments)
+        if code is not None:
+            return code.run(*arguments)
+        return by_torch(self.traced, self.cached.function.__name__, arguments)
 
-    return call
+    def cached_code(self, arguments: tuple[Any, ...]) -> Code | None:
+        """Returns code that holds for arguments; None: calls are recorded, or torch compiles in each process."""
+        return self.cached.code_for(arguments) if on_cpu(arguments) and not recording() else None
+
+
+def on_cpu(arguments: tuple[Any, ...]) -> bool:
+    """Checks whether the first argument is on the CPU."""
+    return flat(arguments[:1])[0].is_cpu
 
 
 def by_torch(traced: Callable[[], Callable[..., Any]], name: str, arguments: tuple[Any, ...]) -> Any:
