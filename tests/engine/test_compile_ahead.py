@@ -17,7 +17,7 @@ from tiny import tiny_settings
 from gsx.builtin import plugins
 from gsx.core.training.trainer import train_step
 from gsx.engine import compile_ahead
-from gsx.engine.compile_ahead import Step, end, help_compiling, helper, needed
+from gsx.engine.compile_ahead import Step, compiling_early, end, help_compiling, helper, needed
 from gsx.engine.compile_cache import CachedFunction, Call, file_of, recorded
 from gsx.engine.compiling import available
 from gsx.experiments.runs.open import start
@@ -78,7 +78,10 @@ class Begun:
     """Nobody's."""
 
     def __init__(self, words: list[str]) -> None:
-        self.words, self.ended = words, list[str]()
+        self.args, self.ended, self.code = words, list[str](), None
+
+    def poll(self) -> int | None:
+        return self.code
 
     def terminate(self) -> None:
         self.ended.append("terminated")
@@ -101,7 +104,7 @@ def test_the_helper_compiles_the_same_calls_from_the_other_end(monkeypatch: pyte
     with helper(step):
         (process,) = begun
         assert process.ended == []
-        help_compiling(process.words[-1])
+        help_compiling(process.args[-1])
     assert process.ended == ["terminated", "waited for"]
     assert made == list(files_of(needed(step, CPU)[::-1]))
     assert len(made) >= 8
@@ -122,6 +125,66 @@ def test_help_is_for_several_functions_and_threads(
     monkeypatch.setattr(compile_ahead, "draw_one", lambda *_: None)
     compile_ahead.compile_ahead(Step(settings=any_path(), sh_degree=3), CPU, helped)
     assert [words["sh_degree"] for words in begun] == ([3] if begins else [])
+
+
+@pytest.fixture
+def begun(monkeypatch: pytest.MonkeyPatch) -> list[Begun]:
+    """Lists second processes, which do nothing."""
+    processes = list[Begun]()
+    monkeypatch.setattr("subprocess.Popen", lambda words, **_: processes.append(Begun(words)) or processes[-1])
+    monkeypatch.setattr("torch.get_num_threads", lambda: 2)
+    return processes
+
+
+def test_a_step_that_is_compiled_early_needs_no_other_process(begun: list[Begun]) -> None:
+    step, same = Step(settings=any_path()), Step(settings=any_path(training_focal=500.0))
+    with helper(step):
+        with helper(same):
+            pass
+        assert len(begun) == 1
+        assert begun[0].ended == []
+        begun[0].code = -9  # killed
+        with helper(step):
+            assert len(begun) == 2
+        assert begun[1].ended == ["terminated", "waited for"]
+    assert begun[0].ended == ["terminated", "waited for"]
+
+
+def test_a_process_for_another_step_ends(begun: list[Begun]) -> None:
+    with helper(Step(settings=any_path())), helper(Step(settings=any_path(), sh_degree=3)):
+        assert len(begun) == 2
+        assert begun[0].ended == ["terminated", "waited for"]
+        assert begun[1].ended == []
+
+
+def test_nothing_begins_early_where_a_step_is_cached(
+    begun: list[Begun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compile_ahead, "functions_folder", lambda: tmp_path)
+    monkeypatch.setattr(compile_ahead, "needed", lambda *_: [object()])
+    step = Step(settings=any_path(), sh_degree=3)
+    with compiling_early(step):
+        assert len(begun) == 1
+    for missing, stamps in ([object()], 0), ([], 1):
+        monkeypatch.setattr(compile_ahead, "uncached", lambda _, missing=missing: missing)
+        monkeypatch.setattr(compile_ahead, "make_ahead", lambda *_: None)
+        monkeypatch.setattr(compile_ahead, "draw_one", lambda *_: None)
+        compile_ahead.compile_ahead(step, CPU)
+        assert len(list(tmp_path.glob("*.done"))) == stamps
+    with compiling_early(step):
+        assert len(begun) == 1
+    with compiling_early(Step(settings=any_path(tile_size=16), sh_degree=3)):
+        assert len(begun) == 2
+
+
+def test_a_helper_ends_with_a_compiler_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    tries = list[int]()
+    monkeypatch.setattr(compile_ahead, "end_with_input", lambda: None)
+    monkeypatch.setattr(compile_ahead, "needed", lambda *_: [1, 2, 3])
+    monkeypatch.setattr(compile_ahead, "uncached", list)
+    monkeypatch.setattr(compile_ahead, "make_ahead", tries.extend)
+    help_compiling(Step(settings=any_path()).words)
+    assert tries == [3]
 
 
 def test_a_process_that_cannot_be_begun_is_done_without(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from pathlib import Path
 from threading import Thread
 
 import torch
@@ -20,13 +22,25 @@ from gsx.core.gaussians.splats import Splats
 from gsx.core.quality.losses import photometric
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.engine.backend import COMPILED
-from gsx.engine.compile_cache import Call, functions_folder, make_ahead, recorded, uncached
+from gsx.engine.cache import content_key
+from gsx.engine.compile_cache import (
+    Call,
+    functions_folder,
+    machine,
+    make_ahead,
+    modes,
+    recorded,
+    sources_of,
+    uncached,
+)
 from gsx.engine.compositors import COMPOSITORS
 
 WARM_SPLATS, WARM_SIZE = 2000, (128, 96)
 """Splats and size of the picture whose drawing compiles everything: lists of several chunks in several groups."""
 HELPER = "import sys; from gsx.engine.compile_ahead import help_compiling; help_compiling(sys.argv[1])"
 """Program of the second process."""
+RUNNING: ContextVar[subprocess.Popen[bytes] | None] = ContextVar("RUNNING", default=None)
+"""The second process; None: none was started."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +52,20 @@ class Step:
     """Degree of the spherical harmonics."""
     absolute_gradient: bool = False
     """True if the backbone needs absolute gradients of screen means."""
+
+    @property
+    def words(self) -> str:
+        """Rules and number of threads as JSON, without what no code depends on."""
+        settings = self.settings.options | {"training_focal": 0.0}
+        return json.dumps(vars(self) | {"settings": settings, "threads": torch.get_num_threads()})
+
+    @property
+    def stamp(self) -> Path | None:
+        """Empty file that exists once all code of the step is cached; None: code is not cached."""
+        folder, sources = functions_folder(), sources_of(__name__)
+        if folder is None or sources is None:
+            return None
+        return folder / f"step-{content_key(self.words, sources, modes(()), machine())}.done"
 
 
 def compile_ahead(
@@ -55,7 +83,16 @@ def compile_ahead(
             make_ahead(calls, stopping)
             if not stopping():
                 draw_one(step, device)
+    if calls and not (missing and uncached(calls)):
+        leave_stamp(step)
     return time.perf_counter() - start
+
+
+def leave_stamp(step: Step) -> None:
+    """Records that all code of a step is cached; on a full disk the next run looks for each function."""
+    if (stamp := step.stamp) is not None:
+        with suppress(OSError):
+            stamp.touch()
 
 
 def needed(step: Step, device: torch.device) -> list[Call]:
@@ -99,27 +136,45 @@ def warm_splats(device: torch.device) -> Splats:
 
 
 @contextmanager
+def compiling_early(step: Step) -> Iterator[None]:
+    """Compiles a step in a second process during the context, unless all of its code is cached."""
+    stamp = step.stamp
+    with helper(step, stamp is not None and not stamp.exists()):
+        yield
+
+
+@contextmanager
 def helper(step: Step, enabled: bool = True) -> Iterator[None]:
     """Runs a process that compiles the calls of a step from the last to the first, as long as the context lasts.
 
-    Starts none if this process has a single thread, or if the system refuses.
+    Starts none if one that runs compiles this step, if this process has a single thread, or if the system refuses.
     """
-    process = None
-    if enabled and torch.get_num_threads() > 1:
-        fields = vars(step) | {"settings": step.settings.options, "threads": torch.get_num_threads()}
-        with suppress(OSError):
-            process = subprocess.Popen(
-                [sys.executable, "-P", "-c", HELPER, json.dumps(fields)],
-                stdin=subprocess.PIPE,  # its end stops the process, also if this one is killed
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C is for this process alone
-            )
+    process = start_helper(step.words) if enabled and torch.get_num_threads() > 1 else None
+    token = RUNNING.set(process or RUNNING.get())
     try:
         yield
     finally:
+        RUNNING.reset(token)
         if process is not None:
             end(process)
+
+
+def start_helper(words: str) -> subprocess.Popen[bytes] | None:
+    """Starts the second process; ends one that runs for another step, and returns None for one that runs for this."""
+    running = RUNNING.get()
+    if running is not None and running.poll() is None:
+        if running.args[-1] == words:  # type: ignore[index]
+            return None
+        end(running)
+    with suppress(OSError):
+        return subprocess.Popen(
+            [sys.executable, "-P", "-c", HELPER, words],
+            stdin=subprocess.PIPE,  # its end stops the process, also if this one is killed
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for this process alone
+        )
+    return None
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
@@ -132,12 +187,15 @@ def end(process: subprocess.Popen[bytes]) -> None:
 
 
 def help_compiling(words: str) -> None:
-    """Compiles the calls of a step from the last to the first, until standard input ends."""
+    """Compiles the calls of a step from the last to the first, until standard input ends or the compiler fails."""
     Thread(target=end_with_input, daemon=True).start()
     fields = json.loads(words)
     torch.set_num_threads(fields.pop("threads"))
     step = Step(**fields | {"settings": RasterSettings(**fields["settings"], compositors=COMPOSITORS)})
-    make_ahead(needed(step, torch.device("cpu"))[::-1])
+    calls = needed(step, torch.device("cpu"))[::-1]
+    make_ahead(calls[:1])
+    if not uncached(calls[:1]):  # else nothing can be compiled
+        make_ahead(calls)
 
 
 def end_with_input() -> None:

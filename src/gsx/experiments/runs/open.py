@@ -28,6 +28,7 @@ from gsx.experiments.run_folder.run_key import composition_key, finished, other_
 from gsx.experiments.run_folder.shapes import is_number
 from gsx.experiments.runs import warm_start
 from gsx.experiments.runs.build import build, choose_device, refuse_uneven
+from gsx.experiments.runs.early_compiling import compiling_before
 from gsx.experiments.runs.environment import environment
 from gsx.experiments.runs.file_axes import start_in_scene
 from gsx.experiments.runs.history import record_changes
@@ -87,7 +88,7 @@ def stamped_folder(parent: Path) -> Path:
 def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None) -> Run:
     """Load the scene and build a run in a new folder, with config.yaml and environment.json.
 
-    Rank 0 makes the folder and claims it until `claims` closes.
+    Rank 0 makes the folder and claims it until `claims` closes. Until then a second process may compile.
 
     Raises:
         ConfigError, InputError: a setting or the scene is wrong; no folder was made.
@@ -101,6 +102,8 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
     if settings.general.viewer:
         require("viewer=true", ("viser",), "gsx[viewer]")
     content = starting_splats(settings)
+    if claims is not None:
+        claims.enter_context(compiling_before(settings))
     scene = ranks.rank0_first(lambda: verified(load_scene(settings)))
     start, doubts = start_in_scene(settings, scene, content)
     run = build(settings, scene, Path(), training=True, start=start)

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import replace
 from threading import Thread
+from typing import Any
 
 import torch
 
@@ -11,12 +12,17 @@ from gsx.core.errors import first_line
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 from gsx.core.rasterizer.compositor import Restricted
-from gsx.core.training.backbone import WithHarmonics
+from gsx.core.training.backbone import Backbone, WithHarmonics
 from gsx.core.training.run import Run
 from gsx.engine.compile_ahead import Step, compile_ahead, warm_camera, warm_splats
 from gsx.engine.compiling import available
 
 logger = logging.getLogger(__name__)
+
+
+def compiles(settings: RasterSettings, steps: int) -> bool:
+    """Return True if a training run of `steps` compiles where it can."""
+    return settings.path == "compiled" or (settings.path == "auto" and steps >= settings.auto_steps)
 
 
 def decide(settings: RasterSettings, steps: int, device: torch.device) -> RasterSettings:
@@ -26,7 +32,7 @@ def decide(settings: RasterSettings, steps: int, device: torch.device) -> Raster
         if isinstance(compositor, Restricted):
             compositor.refuse(settings, device)
         return settings
-    long_enough = steps >= settings.auto_steps
+    long_enough = compiles(settings, steps)
     compiled = long_enough and available(device.type)
     reason = f"{steps} steps" if compiled or not long_enough else "no working compiler"
     path = "compiled" if compiled else "eager"
@@ -34,15 +40,18 @@ def decide(settings: RasterSettings, steps: int, device: torch.device) -> Raster
     return replace(settings, path=path)
 
 
+def rules_of_step(backbone: Backbone[Any], raster: RasterSettings) -> Step:
+    """Return what the code of a backbone's steps depends on."""
+    degree = backbone.sh_degree if isinstance(backbone, WithHarmonics) else 0
+    return Step(settings=raster, sh_degree=degree, absolute_gradient=backbone.absolute_gradient)
+
+
 def warm(run: Run, helped: bool = True) -> None:
     """Compile rasterizer and loss before the first step, and log the time; `helped`: by a second process."""
     if not run.raster.backend.on(run.device.type).compiled:
         return
     logger.info("compiling the rasterizer once; later runs find it on disk ...")
-    backbone = run.backbone
-    degree = backbone.sh_degree if isinstance(backbone, WithHarmonics) else 0
-    step = Step(settings=run.raster, sh_degree=degree, absolute_gradient=backbone.absolute_gradient)
-    seconds = compile_ahead(step, run.device, helped, lambda: run.progress.stopping)
+    seconds = compile_ahead(rules_of_step(run.backbone, run.raster), run.device, helped, lambda: run.progress.stopping)
     if not run.progress.stopping:
         logger.info("compiled in %.0f s", seconds)
 
