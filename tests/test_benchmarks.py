@@ -527,6 +527,36 @@ def test_a_multirun_over_processes_is_compared_within_its_rounds() -> None:
     assert together["ratio"] == "2.00 (1.25 to 3.00)"  # 10/5, 30/10, 20/16
 
 
+def test_the_capture_for_memory_is_read_with_its_cameras(tmp_path: Path) -> None:
+    import memory
+    from gsx.builtin import plugins
+    from gsx.experiments.runs.compose import compose
+    from gsx.experiments.runs.load_scene import load_scene
+
+    memory.make_capture(tmp_path, photos=6, size=(64, 48))
+    scene = load_scene(compose([*memory.SUBJECTS["many"], f"scene.path={tmp_path}"], plugins()))
+    assert [view.camera.size for view in scene.train] == [(64, 48)] * 6
+    for view in scene.train:
+        assert view.image().shape == (3, 48, 64)
+        places, depths = view.camera.project(torch.zeros(1, 3))
+        assert torch.allclose(places, torch.tensor([[32.0, 24.0]]), atol=1e-3)
+        assert float(depths) == pytest.approx(math.hypot(3, 0.5), rel=1e-5)
+
+
+def test_a_phase_has_the_largest_of_its_peaks(monkeypatch: pytest.MonkeyPatch) -> None:
+    import memory
+
+    readings = iter([5e6, 3e6, 7e6])
+    monkeypatch.setattr(memory, "host_peak", lambda: next(readings))
+    monkeypatch.setattr(memory, "forget_peak", lambda: None)
+    peaks = memory.Peaks()
+    peaks.gsx_run_started(SimpleNamespace(scene=SimpleNamespace(train=[])))
+    views = SimpleNamespace(raster_scale={1: 1, 2: 2}.get)
+    for number in (1, 2):
+        peaks.gsx_step_finished(SimpleNamespace(step=number, views=views))
+    assert peaks.phases == {"start": 5, "steps": 3, "finer steps": 7, "evaluation": 0}
+
+
 def test_shared_cores_are_compared_within_a_round() -> None:
     import shared_cores
 

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -20,11 +21,13 @@ from raster_scenes import (
     render_with_gradients,
     truth_of,
 )
+from torch import Tensor
 
 from gsx.core.gaussians.sh import colours_of
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import rasterize
 from gsx.core.rasterizer.composite import composite_eager
+from gsx.core.rasterizer.intersections import TileIntersections, intersect_tiles
 from gsx.engine import compiled, lanes
 from gsx.engine.backend import COMPILED
 from gsx.engine.compile_cache import TRACING, file_of, recorded
@@ -196,6 +199,26 @@ def test_places_of_pairs_are_only_found_for_gradients(monkeypatch: pytest.Monkey
         torch.testing.assert_close(rasterize(splats, front_camera(), QUICK).image, wanted)
     with pytest.raises(AssertionError, match="asked for"):
         rasterize(leaves(splats), front_camera(), QUICK)
+
+
+@pytest.mark.parametrize("schedule", ["chunks", "segments"])
+def test_until_its_backward_pass_a_render_holds_no_lists_of_pairs(
+    schedule: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lists = list[weakref.ref[Tensor]]()
+
+    def watched(*arguments: Any) -> TileIntersections:
+        found = intersect_tiles(*arguments)
+        lists.extend(weakref.ref(table) for table in (found.splats, found.tiles, found.slots))
+        return found
+
+    monkeypatch.setattr("gsx.core.rasterizer.render.intersect_tiles", watched)
+    splats = leaves(opaque(400, 5))
+    image = rasterize(splats, front_camera(), replace(QUICK, schedule=schedule)).image
+    assert len(lists) == 3
+    assert all(table() is None for table in lists)
+    image.sum().backward()
+    assert splats.means.grad is not None
 
 
 def test_room_for_gradients_is_zero_where_no_slice_was_blended() -> None:

@@ -13,6 +13,16 @@ CHOSEN = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_MAX_", "MALLOC_MMAP_THRESHOLD_"
 """Variables by which users choose for themselves."""
 
 
+def return_freed_memory() -> None:
+    """Lets glibc return all free pages to the system; using them again costs faults.
+
+    For changes of the sizes of tensors: new sizes do not fit into the gaps that old ones leave.
+    """
+    if sys.platform.startswith("linux"):
+        with suppress(AttributeError, OSError):
+            ctypes.CDLL(None).malloc_trim(0)
+
+
 def keep_freed_memory() -> None:
     """Lets glibc take large tensors from its heap, and keep up to MOST_KEPT bytes of what is freed at its end.
 

@@ -9,7 +9,7 @@ import functools
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import torch
@@ -285,16 +285,17 @@ class CompiledComposite(torch.autograd.Function):
             compiled_loop(transmit, job.rules)(rows[:2], job.basis.x, job.basis.y, inside.clone()[:2])
         accumulated, kept = blend_chunks(job, rows, inside)
         if job.learning:
-            ctx.kept = (job, intersections, places, len(means), kept, absgrad is not None, means.dtype)
+            owners, job = (intersections.order, intersections.counts), replace(job, lanes=job.lanes.without_entries())
+            ctx.kept = (job, owners, places, len(means), kept, absgrad is not None, means.dtype)
         columns, lines = job.grid.shape
         return job.grid.to_raster(from_lanes(accumulated, job.lanes, columns * lines)).to(means.dtype)
 
     @staticmethod
     def backward(ctx, gradient):
-        job, intersections, places, count, kept, absolute, dtype = ctx.kept
+        job, owners, places, count, kept, absolute, dtype = ctx.kept
         in_lanes = to_lanes(job.grid.to_tiles(gradient.to(job.precision.accumulation)), job.lanes)
         values = chunk_gradients(job, kept, in_lanes).flatten(0, 2)
-        total = sum_by_splat(values, intersections, places, count).to(dtype)
+        total = sum_by_splat(values, places, *owners, count).to(dtype)
         width = TABLE + job.rules.channels
         absgrad = total[:, width:] if absolute else None
         return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], absgrad, None, None)

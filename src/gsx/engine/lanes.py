@@ -9,7 +9,7 @@ Each chunk is a call, which costs as much as a dozen groups: where a few tiles h
 those are cut into pieces, which fill lanes as the lists of other tiles do.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import torch
@@ -56,6 +56,11 @@ class Lanes:
     follows: list[tuple[Places, Places]]
     """(places of second pieces of tiles, of the first ones), then of third pieces and the second ones, and so on;
     nothing where no list was cut."""
+
+    def without_entries(self) -> "Lanes":
+        """Returns the lanes without pairs and entries, which a backward pass does not need."""
+        pairs, entries = (table.new_empty(0, *table.shape[1:]) for table in (self.pairs, self.entries))
+        return replace(self, pairs=pairs, entries=entries)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

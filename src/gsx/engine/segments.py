@@ -284,15 +284,15 @@ class SegmentComposite(torch.autograd.Function):
     def forward(ctx, table, absgrad, intersections, job):
         picture, kept = blend_segments(job, table.to(job.precision.exact))
         if any(ctx.needs_input_grad):
-            ctx.kept = (job, intersections, len(table), kept, absgrad is not None)
+            ctx.kept = (job, (intersections.order, intersections.counts), len(table), kept, absgrad is not None)
         return job.grid.to_raster(picture).to(table.dtype)
 
     @staticmethod
     def backward(ctx, gradient):
-        job, intersections, count, kept, absolute = ctx.kept
+        job, owners, count, kept, absolute = ctx.kept
         by_tile = job.grid.to_tiles(gradient.to(job.precision.accumulation))
         moments = segment_moments(job, kept, by_tile)
         values = compiled_loop(entry_gradients, job.rules)(kept.rows, moments).flatten(0, 1)
-        total = sum_by_splat(values, intersections, job.segments.places, count).to(gradient.dtype)
+        total = sum_by_splat(values, job.segments.places, *owners, count).to(gradient.dtype)
         width = TABLE + job.rules.channels
         return total[:, :width], total[:-1, width:] if absolute else None, None, None

@@ -49,20 +49,35 @@ def test_what_has_room_is_decoded_once_and_makes_room_for_others() -> None:
     assert coarse.asked == 1
 
 
-def test_what_ssim_takes_of_a_photograph_is_found_once_while_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_moments_are_computed_once_if_those_of_all_photos_have_room(monkeypatch: pytest.MonkeyPatch) -> None:
     views = [View(str(number), CAMERA, Counted(51 * number)) for number in range(3)]
     pictures = [view.image() for view in views]
-    monkeypatch.setattr(module, "MOMENT_BYTES", 2 * 2 * 4 * BYTES + 1)  # two of each four-byte number of two pictures
+    monkeypatch.setattr(module, "MOMENT_BYTES", 2 * 2 * 4 * BYTES)  # two float32 pictures of two photos
     photographs = PhotoCache(torch.device("cpu"), room=0)
     photographs.set_views(views)
-    first = [photographs.moments_of(view, picture, EAGER) for view, picture in zip(views, pictures, strict=True)]
-    assert first[2] is None
-    for found, view, picture in zip(first[:2], views, pictures, strict=False):
-        assert photographs.moments_of(view, picture, EAGER) is found
-        assert all(map(torch.equal, found, moments_of(picture)))
+    assert [photographs.moments_of(*each, EAGER) for each in zip(views, pictures, strict=True)] == [None] * 3
+    assert not photographs.moments
+    photographs.set_views(views[:2])
+    for view, picture in zip(views[:2], pictures, strict=False):
+        moments = photographs.moments_of(view, picture, EAGER)
+        assert moments is not None
+        assert photographs.moments_of(view, picture, EAGER) is moments
+        assert all(map(torch.equal, moments, moments_of(picture)))
     photographs.set_views(views[2:])
     assert not photographs.moments
     assert photographs.moments_of(views[2], pictures[2], EAGER) is not None
+
+
+def test_moments_of_photos_of_several_sizes_stay_within_their_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOMENT_BYTES", 10 * 2 * 4 * BYTES)
+    views = [View(str(number), CAMERA, Counted(0)) for number in range(6)]
+    photographs = PhotoCache(torch.device("cpu"), room=0)
+    photographs.set_views(views)
+    for width, view in enumerate(views, 1):
+        photographs.moments_of(view, torch.zeros(3, 4, 4 * width), EAGER)
+    held = sum(moment.nbytes for moments in photographs.moments.values() for moment in moments)
+    assert len(photographs.moments) == 3  # up to 12 px wide: six such photos fill 9 of the 10
+    assert held == 2 * 4 * 3 * 4 * (4 + 8 + 12) <= module.MOMENT_BYTES
 
 
 @pytest.mark.parametrize(

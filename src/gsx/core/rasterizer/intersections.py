@@ -168,11 +168,14 @@ def sorted_pairs(
 
 
 def sum_by_splat(
-    values: Float[Tensor, "E V"], intersections: TileIntersections, places: Int[Tensor, "P"], count: int
-) -> Float[Tensor, "count V"]:
-    """Sums over the entries of each splat in a fixed order; `places`: entry of each pair, pairs sorted by splat."""
-    sums = bag_sums(values, places, edges_of(intersections.counts))
-    return values.new_zeros(count, values.shape[1]).index_copy_(0, intersections.order, sums)
+    values: Float[Tensor, "E V"], places: Int[Tensor, "P"], order: Int[Tensor, "M"], counts: Int[Tensor, "M"], rows: int
+) -> Float[Tensor, "rows V"]:
+    """Sums over the entries of each splat in a fixed order; `places`: entry of each pair, pairs sorted by splat.
+
+    `order` and `counts` are those of TileIntersections: a backward pass need not hold its lists of pairs.
+    """
+    sums = bag_sums(values, places, edges_of(counts))
+    return values.new_zeros(rows, values.shape[1]).index_copy_(0, order, sums)
 
 
 def refuse_too_many(counts: Int[Tensor, "N"], grid: TileGrid, settings: RasterSettings) -> int:

@@ -12,6 +12,7 @@ from gsx.core.files import read_json, remove_partial, write_json
 from gsx.core.plugins import Plugins, hookimpl
 from gsx.core.training.run import Run, StepResult
 from gsx.core.training.trainer import train
+from gsx.engine.allocator import return_freed_memory
 from gsx.engine.cache import cache_root, trim
 from gsx.engine.compile_cache import training_clock
 from gsx.experiments.evaluation.remarks import CapNotice
@@ -47,6 +48,26 @@ class Checkpointer:
         checkpoint.save(run)
 
 
+class MemoryTrimmer:
+    """Listener that returns freed memory where the sizes of tensors change: before, between and after steps."""
+
+    @hookimpl
+    def gsx_run_started(self) -> None:
+        """Return what building the run has freed."""
+        return_freed_memory()
+
+    @hookimpl
+    def gsx_step_finished(self, run: Run) -> None:
+        """Return it if the next step renders other cameras."""
+        if not run.complete and run.views.changes_after(run.step):
+            return_freed_memory()
+
+    @hookimpl
+    def gsx_training_finished(self) -> None:
+        """Return what steps have used."""
+        return_freed_memory()
+
+
 def status(run: Run, state: str, reason: str = "") -> None:
     """Write the state of a run to status.json."""
     write_json(run.folder / "status.json", {"state": state, "reason": reason, "step": run.step})
@@ -69,7 +90,7 @@ def execute(run: Run, settings: Settings, plugins: Plugins, keep_states: bool = 
     status(run, "running")
     general, log = settings.general, MetricsLog(settings.evaluation)
     first = [Guard(), Agreement(), CapNotice(), log]  # trackers read the log
-    listeners: list[object] = [*first, *trackers, Checkpointer(), Progress()]
+    listeners: list[object] = [*first, *trackers, Checkpointer(), Progress(), MemoryTrimmer()]
     if keep_states and general.init == "warm_start":
         states = warm_start.warm_start_folder(run, settings.idle, plugins.versions)
         listeners.append(warm_start.WarmStartKeeper(states, general.disk_cache_gb, general.warm_start_at))
