@@ -1,4 +1,4 @@
-"""Peak resident memory of whole training processes by phase (docs/benchmarks/memory.md).
+"""Peak resident memory of whole training processes by phase.
 
     python benchmarks/memory.py SCENES [--only fox,many] [--against REVISION]
 
