@@ -15,6 +15,7 @@ from gsx.experiments.minutes.overriding import overridden
 from gsx.experiments.minutes.plan import SIZE, Plan, Task, changes_of, plan_run, schedule_of
 from gsx.experiments.minutes.probe import LENGTH, measure
 from gsx.experiments.runs.build import choose_device
+from gsx.experiments.runs.early_compiling import compiling_before
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.settings import Settings
 
@@ -69,7 +70,8 @@ def planned(settings: Settings, words: Sequence[str], loaded: Plugins, started: 
         return settings
     started, fixed, options = time.monotonic() if started is None else started, keys_of(words), plan_options()
     refuse(settings, fixed)
-    task = task_of(settings, fixed, limit, started, options, loaded)
+    with compiling_before(overridden(settings, {"iterations": LENGTH}, loaded)):
+        task = task_of(settings, fixed, limit, started, options, loaded)
     plan = plan_run(task)
     changes = {"minutes": 0.0, "seconds": 0.0, **changes_of(task, plan)}
     again = [word for word in words if word.partition("=")[0] not in TIMES]
