@@ -292,10 +292,10 @@ class CompiledComposite(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, gradient):
-        job, owners, places, count, kept, absolute, dtype = ctx.kept
+        job, (order, counts), places, count, kept, absolute, dtype = ctx.kept
         in_lanes = to_lanes(job.grid.to_tiles(gradient.to(job.precision.accumulation)), job.lanes)
         values = chunk_gradients(job, kept, in_lanes).flatten(0, 2)
-        total = sum_by_splat(values, places, *owners, count).to(dtype)
+        total = sum_by_splat(values, places, order, counts, count).to(dtype)
         width = TABLE + job.rules.channels
         absgrad = total[:, width:] if absolute else None
         return (total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:width], absgrad, None, None)

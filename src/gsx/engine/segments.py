@@ -289,10 +289,10 @@ class SegmentComposite(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, gradient):
-        job, owners, count, kept, absolute = ctx.kept
+        job, (order, counts), count, kept, absolute = ctx.kept
         by_tile = job.grid.to_tiles(gradient.to(job.precision.accumulation))
         moments = segment_moments(job, kept, by_tile)
         values = compiled_loop(entry_gradients, job.rules)(kept.rows, moments).flatten(0, 1)
-        total = sum_by_splat(values, job.segments.places, *owners, count).to(gradient.dtype)
+        total = sum_by_splat(values, job.segments.places, order, counts, count).to(gradient.dtype)
         width = TABLE + job.rules.channels
         return total[:, :width], total[:-1, width:] if absolute else None, None, None
