@@ -57,8 +57,17 @@ def test_cost_of_a_step_by_a_measurement() -> None:
         path="eager",
         device="cpu",
     )
-    options = CostOptions(late=0.5, primitives=2.0, rows={"anchors": 3.0})
+    options = CostOptions(late=0.5, primitives=2.0, event=5.0, rows={"anchors": 3.0})
     cost = step_cost(measurement, options, "free")
     assert cost.seconds(0, 0) == pytest.approx(0.042)
     assert cost.seconds(1e6, 10_000) == pytest.approx(0.05 + 0.2)
     assert step_cost(measurement, options, "anchors").row == pytest.approx(3 * 0.8e-6)
+
+
+def test_events_of_density_control_take_steps() -> None:
+    """4 events of 5 steps each at 0.1 s, in the first half of the run."""
+    cost, stages = StepCost(base=0.1, pixel=0.0, row=0.0, event=5.0), stages_of(1, 0.0, 1, 0.0)
+    growth = Growth(first=10, last=10, start=0.0, stop=0.5, power=0.5, events=4.0)
+    seconds = planned_seconds(cost, stages, growth, 1e4, 100)
+    assert seconds[-1] == pytest.approx(10 + 2)
+    assert seconds[SHARES // 2 - 1] == pytest.approx(5 + 2)

@@ -57,11 +57,18 @@ class Growth:
     stop: float
     """Share of the steps at which growth ends."""
     power: float
+    events: float = 0.0
+    """Events of density control."""
 
     def at(self, share: float) -> float:
         """Returns the rows at a share of the steps."""
         passed = min(1.0, max(0.0, (share - self.start) / max(self.stop - self.start, 1e-9)))
         return self.first + (self.last - self.first) * passed**self.power
+
+    def events_between(self, start: float, stop: float) -> float:
+        """Returns the mean number of events between two shares of the steps."""
+        common = max(0.0, min(stop, self.stop) - max(start, self.start))
+        return self.events * common / max(self.stop - self.start, 1e-9)
 
 
 def stages_of(coarse: int, coarse_until: float, fine: int, fine_from: float) -> list[Stage]:
@@ -84,11 +91,12 @@ def stages_of(coarse: int, coarse_until: float, fine: int, fine_from: float) -> 
 
 @dataclass(frozen=True, kw_only=True)
 class StepCost:
-    """Seconds of a step: base + pixels + primitives."""
+    """Seconds of a step: base + pixels + primitives; those of an event in steps."""
 
     base: float
     pixel: float
     row: float
+    event: float = 0.0
 
     def seconds(self, pixels: float, rows: float) -> float:
         """Returns the seconds of a step."""
@@ -99,7 +107,8 @@ def step_cost(measurement: Measurement, options: CostOptions, backbone: str) -> 
     """Returns the cost of a step by a measurement at the start and the relative costs of the options."""
     pixel = options.late * measurement.megapixel / MILLION
     row = measurement.megapixel / MILLION * options.primitives * options.rows.get(backbone, 1.0)
-    return StepCost(base=max(0.0, measurement.base - row * measurement.primitives), pixel=pixel, row=row)
+    base = max(0.0, measurement.base - row * measurement.primitives)
+    return StepCost(base=base, pixel=pixel, row=row, event=options.event)
 
 
 SHARES = 40
@@ -118,9 +127,11 @@ def planned_seconds(cost: StepCost, stages: Sequence[Stage], growth: Growth, pix
     """
     total, sums = 0.0, list[float]()
     for number in range(SHARES):
-        parts = stage_parts(stages, number / SHARES, (number + 1) / SHARES)
-        rows = growth.at((number + 0.5) / SHARES)
-        total += sum(steps * share * cost.seconds(pixels * stage.scale**2, rows) for stage, share in parts)
+        start, stop = number / SHARES, (number + 1) / SHARES
+        rows, more = growth.at((start + stop) / 2), cost.event * growth.events_between(start, stop)
+        for stage, share in stage_parts(stages, start, stop):
+            seconds = cost.seconds(pixels * stage.scale**2, rows)
+            total += (steps * share + more * share * SHARES) * seconds
         sums.append(total)
     return sums
 

@@ -30,6 +30,8 @@ class CostOptions:
     """Cost of a pixel in the whole run relative to the first steps."""
     primitives: float
     """Megapixels that cost as much as 10^6 primitives."""
+    event: float
+    """Steps that an event of density control costs."""
     rows: dict[str, float]
     """Primitives that one row of a backbone's table costs; others: 1."""
 

@@ -14,6 +14,8 @@ from gsx.experiments.runs.settings import Settings
 SIZE, CAPACITY, BUDGET = "scene.downscale", "backbone.capacity", "backbone.budget.primitives"
 PATH, PASSES = "rasterizer.path", "backbone.density.passes"
 CHECKS, FINE_FROM = "training.test_points", "training.supersampling.start"
+EVERY = 100
+"""Steps between events of density control in published runs (3D-GS)."""
 MOST_DOWNSCALE = 64
 """Largest reduction of photos."""
 CHECKED = 8
@@ -168,7 +170,16 @@ def growth_of(task: Task, downscale: int, steps: int) -> Growth:
     if values.get(CAPACITY) == "budget" and CAPACITY in task.fixed:
         last = values[BUDGET]
     start, stop = growth_window(task)
-    return Growth(first=first, last=max(1, round(last)), start=start, stop=stop, power=0.5)
+    events = events_of(task, steps)
+    return Growth(first=first, last=max(1, round(last)), start=start, stop=stop, power=0.5, events=events)
+
+
+def events_of(task: Task, steps: int) -> float:
+    """Returns the events of density control: a pass over the views or a published interval apart, but some at least."""
+    start, stop = growth_window(task)
+    growing = steps * (stop - start)
+    every = max(task.views, EVERY * steps / task.published)
+    return max(growing / every, min(growing, task.options.events))
 
 
 def rows_of(task: Task) -> float:
