@@ -1,5 +1,7 @@
 """Cost model of training against sums by hand."""
 
+from dataclasses import replace
+
 import pytest
 
 from gsx.experiments.minutes.cost import (
@@ -57,11 +59,14 @@ def test_cost_of_a_step_by_a_measurement() -> None:
         path="eager",
         device="cpu",
     )
-    options = CostOptions(late=0.5, primitives=2.0, event=5.0, rows={"anchors": 3.0})
+    options = CostOptions(late=0.5, primitives=2.0, event=5.0, random=0.25, rows={"anchors": 3.0})
     cost = step_cost(measurement, options, "free")
     assert cost.seconds(0, 0) == pytest.approx(0.042)
     assert cost.seconds(1e6, 10_000) == pytest.approx(0.05 + 0.2)
     assert step_cost(measurement, options, "anchors").row == pytest.approx(3 * 0.8e-6)
+    scattered = step_cost(replace(measurement, random=True), options, "free")
+    assert scattered.seconds(0, 0) == pytest.approx(0.042 / 4)
+    assert scattered.seconds(1e6, 10_000) == pytest.approx(0.25 / 4)
 
 
 def test_events_of_density_control_take_steps() -> None:

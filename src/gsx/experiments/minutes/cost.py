@@ -32,6 +32,8 @@ class Measurement:
     """Path of the rasterizer that was measured."""
     device: str
     """Type of the device that was measured: cpu or cuda."""
+    random: bool = False
+    """True: the model began with random points, which cover many pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,9 +107,11 @@ class StepCost:
 
 def step_cost(measurement: Measurement, options: CostOptions, backbone: str) -> StepCost:
     """Returns the cost of a step by a measurement at the start and the relative costs of the options."""
-    pixel = options.late * measurement.megapixel / MILLION
-    row = measurement.megapixel / MILLION * options.primitives * options.rows.get(backbone, 1.0)
-    base = max(0.0, measurement.base - row * measurement.primitives)
+    lasting = options.random if measurement.random else 1.0
+    unit, base = lasting * measurement.megapixel / MILLION, lasting * measurement.base
+    row = unit * options.primitives * options.rows.get(backbone, 1.0)
+    base = max(0.0, base - row * measurement.primitives)
+    pixel = unit * options.late
     return StepCost(base=base, pixel=pixel, row=row, event=options.event)
 
 

@@ -32,6 +32,8 @@ class CostOptions:
     """Megapixels that cost as much as 10^6 primitives."""
     event: float
     """Steps that an event of density control costs."""
+    random: float
+    """Cost of pixels and primitives in the whole run relative to the first steps, if those begin with random points."""
     rows: dict[str, float]
     """Primitives that one row of a backbone's table costs; others: 1."""
 

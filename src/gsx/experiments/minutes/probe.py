@@ -81,6 +81,7 @@ def measure(
         check=median_seconds(run, lambda view: render(run, view.camera), scene.test[:SAMPLES]),
         path=run.raster.path,
         device=run.device.type,
+        random=getattr(short.scene.options, "random_points", 0) == len(scene.points),
     )
     return measurement, scene
 
