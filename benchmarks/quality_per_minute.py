@@ -38,7 +38,7 @@ from measuring.quality_tables import REACHED_ZOOMS, Row, curve_of, place_of, rea
 from measuring.results import Section, read_sections, text_table, write_results
 from measuring.revisions import checked_out
 from measuring.runs import clock_of, gsx, train, wall_seconds
-from zoom import numbers, refuse_unknown, shared_arguments
+from zoom import refuse_unknown, shared_arguments
 
 FILE, RUNS, REACHED = "quality_per_minute_cpu", "runs", "reached"
 """Name of the results, and of their sections."""
@@ -77,7 +77,7 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     """Parses the command line."""
     parser = shared_arguments(__doc__, ",".join(SUBJECTS), "outputs/quality_per_minute")
     parser.add_argument("--arms", default=f"{BEFORE},{NOW},{OPENSPLAT}", help=f"by commas, of {', '.join(ARMS)}")
-    parser.add_argument("--minutes", type=numbers, default=[1, 2, 5, 10], help="wall times by commas (1,2,5,10)")
+    parser.add_argument("--minutes", type=times, default=[1.0, 2.0, 5.0, 10.0], help="wall times by commas (1,2,5,10)")
     parser.add_argument("--opensplat", type=Path, default=None, help="program of OpenSplat; none: without its rows")
     parser.add_argument("--threads", type=int, default=2, help="threads of each run (2)")
     parser.set_defaults(seeds=[0])
@@ -85,6 +85,11 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
     if options.jobs > 1:
         parser.error("--jobs is for other benchmarks: these runs take turns")
     return options
+
+
+def times(text: str) -> list[float]:
+    """Reads wall times by commas, minutes."""
+    return [float(word) for word in text.split(",")]
 
 
 # -- runs --------------------------------------------------------------------------------------------------------------
