@@ -56,9 +56,9 @@ BEFORE, NOW, OPENSPLAT, SHORT = "before", "now", "opensplat", "opensplat_short"
 ARMS = (BEFORE, NOW, OPENSPLAT, SHORT)
 OTHERS = (OPENSPLAT, SHORT)
 """Arms of another program."""
-PROBES = {BEFORE: (100, 400), OPENSPLAT: (200, 800), SHORT: (200, 800)}
+PROBES = {BEFORE: (300, 500), OPENSPLAT: (200, 800), SHORT: (200, 800)}
 """Steps of the two runs that are timed first."""
-WARM = ("iterations=30", "training.test_points=0")
+WARM = ("iterations=30", "training.test_points=0", "rasterizer=compiled")
 """Run that fills the cache: compiled code, poses, pictures."""
 EVALUATION = ("eval.zoom=[1,2,4]", "eval.pairs=0", "eval.flight=false", "metrics.perceptual=[]")
 """Overrides of `gsx eval`, the same for all arms."""
