@@ -287,7 +287,7 @@ def test_arms_take_turns_and_finished_runs_are_not_repeated(
     benchmark.main(words)
     trained = [call[0] for call in calls if not call[0].startswith(("warm", "eval", "opensplat"))]
     assert trained == [
-        *("before_demo_probe_100_0", "before_demo_probe_400_0", "before_demo_1_minutes_0", "now_demo_1_minutes_0"),
+        *("before_demo_probe_300_0", "before_demo_probe_500_0", "before_demo_1_minutes_0", "now_demo_1_minutes_0"),
         *("before_demo_2_minutes_0", "now_demo_2_minutes_0"),
     ]
     assert [call[2] for call in calls if call[0] == "opensplat"] == ["200", "800", "55", "115"]

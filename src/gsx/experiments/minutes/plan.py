@@ -204,11 +204,17 @@ def changes_of(task: Task, plan: Plan) -> Mapping[str, Any]:
     changes |= {"iterations": plan.steps, PATH: task.measurement.path}
     if SIZE in values and SIZE not in fixed:
         changes[SIZE] = plan.downscale
-    if values.get(CAPACITY) == "published" and CAPACITY not in fixed:
-        changes |= {CAPACITY: "budget", BUDGET: plan.primitives}
+    changes |= capacity_of(values, fixed, plan.primitives)
     if PASSES in values and PASSES not in fixed:
         changes[PASSES] = passes_of(task, plan)
     return changes | deadline_of(values, plan)
+
+
+def capacity_of(values: Mapping[str, Any], fixed: frozenset[str], primitives: int) -> dict[str, Any]:
+    """Returns the values by which a run grows to a number of primitives; empty: its growth is chosen, or fixed."""
+    if values.get(CAPACITY) != "published" or CAPACITY in fixed:
+        return {}
+    return {CAPACITY: "budget", BUDGET: primitives}
 
 
 def passes_of(task: Task, plan: Plan) -> float:

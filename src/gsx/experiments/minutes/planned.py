@@ -8,11 +8,12 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from gsx.core.errors import ConfigError, command
+from gsx.core.options import flattened
 from gsx.core.plugins import Plugins
 from gsx.engine.processes import processes
 from gsx.experiments.minutes.options import PlanOptions, plan_options
 from gsx.experiments.minutes.overriding import overridden
-from gsx.experiments.minutes.plan import SIZE, Plan, Task, changes_of, plan_run, schedule_of
+from gsx.experiments.minutes.plan import SIZE, Plan, Task, capacity_of, changes_of, plan_run, schedule_of
 from gsx.experiments.minutes.probe import LENGTH, measure
 from gsx.experiments.runs.build import choose_device
 from gsx.experiments.runs.early_compiling import compiling_before
@@ -21,6 +22,8 @@ from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger(__name__)
 
+MANY = 10**6
+"""Primitives of a budget that is not planned yet: its code is compiled and measured."""
 TIMES = ("minutes", "seconds")
 LENGTHS = ("iterations", "length", "budget", "budget.share")
 """Keys that choose the number of steps."""
@@ -70,8 +73,9 @@ def planned(settings: Settings, words: Sequence[str], loaded: Plugins, started: 
         return settings
     started, fixed, options = time.monotonic() if started is None else started, keys_of(words), plan_options()
     refuse(settings, fixed)
-    with compiling_before(overridden(settings, {"iterations": LENGTH}, loaded)):
-        task = task_of(settings, fixed, limit, started, options, loaded)
+    changes = schedule_of(settings, fixed, options) | capacity_of(flattened(settings.resolved), fixed, MANY)
+    with compiling_before(overridden(settings, changes | {"iterations": LENGTH}, loaded)):
+        task = task_of(settings, fixed, changes, limit - (time.monotonic() - started), options, loaded)
     plan = plan_run(task)
     changes = {"minutes": 0.0, "seconds": 0.0, **changes_of(task, plan)}
     again = [word for word in words if word.partition("=")[0] not in TIMES]
@@ -120,19 +124,34 @@ def refuse(settings: Settings, fixed: frozenset[str]) -> None:
 
 
 def task_of(
-    settings: Settings, fixed: frozenset[str], limit: float, started: float, options: PlanOptions, loaded: Plugins
+    settings: Settings,
+    fixed: frozenset[str],
+    changes: dict[str, Any],
+    seconds: float,
+    options: PlanOptions,
+    loaded: Plugins,
 ) -> Task:
-    """Measures this machine on the scene and returns what is to be planned."""
+    """Measures this machine on the scene and returns what is to be planned.
+
+    Args:
+        settings: Settings of the run to plan.
+        fixed: Keys whose values the plan keeps.
+        changes: Values by dotted key that every plan has.
+        seconds: Wall time until the report.
+        options: Constants of planning.
+        loaded: Plugins.
+    """
+    start = time.monotonic()
     downscale = probe_downscale(settings, fixed, options)
-    logger.info("measuring a few steps to plan %s ...", in_words(limit))
-    changes = schedule_of(settings, fixed, options) | ({} if downscale is None else {SIZE: downscale})
-    measurement, scene = measure(settings, changes, options.probe, loaded)
+    logger.info("measuring a few steps to plan %s ...", in_words(seconds))
+    sized = changes if downscale is None else changes | {SIZE: downscale}
+    measurement, scene = measure(settings, sized, options.probe, loaded)
     return Task(
         settings=settings,
         fixed=fixed,
         views=len(scene.train),
         tests=len(scene.test),
-        seconds=limit - (time.monotonic() - started),
+        seconds=seconds - (time.monotonic() - start),
         published=settings.resolved["backbone"].get("published_iterations", LENGTH),
         measurement=measurement,
         options=options,
