@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,6 +16,13 @@ from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.files import write_json
 from measuring.runs import clock_of
 
+WRAPPER = """\
+import pathlib, resource, subprocess, sys
+code = subprocess.call(sys.argv[2:])
+pathlib.Path(sys.argv[1]).write_text(str(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss))
+sys.exit(code)
+"""
+"""Small process that starts a program: Linux counts the starting process's memory in the peak of its child."""
 IMAGES, MODEL = "images", "sparse/0"
 """Folders of the photos and of the COLMAP model."""
 CENTRE = 0.01
@@ -98,13 +106,14 @@ def run_opensplat(
     to = file_of(place)
     command = [str(program), str(scene), "--keep-crs", "--output", str(to), *words]
     to.parent.mkdir(parents=True, exist_ok=True)
+    peak = to.with_suffix(".peak")
     started = time.perf_counter()
     with log.open("w") as stream:
-        process = subprocess.Popen(command, env=os.environ | environment, stdout=stream, stderr=subprocess.STDOUT)
-        _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode or not to.is_file():
-        raise subprocess.CalledProcessError(process.returncode, command)
-    facts = {"wall_seconds": time.perf_counter() - started, "peak_mb": usage.ru_maxrss * 1024 / 1e6}
+        words = [sys.executable, "-c", WRAPPER, str(peak), *command]
+        code = subprocess.call(words, env=os.environ | environment, stdout=stream, stderr=subprocess.STDOUT)
+    if code or not to.is_file():
+        raise subprocess.CalledProcessError(code, command)
+    facts = {"wall_seconds": time.perf_counter() - started, "peak_mb": int(peak.read_text()) * 1024 / 1e6}
+    peak.unlink()
     write_json(clock_of(place), facts)
     return facts
