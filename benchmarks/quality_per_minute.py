@@ -60,6 +60,8 @@ PROBES = {BEFORE: (300, 500), OPENSPLAT: (200, 800), SHORT: (200, 800)}
 """Steps of the two runs that are timed first."""
 WARM = ("iterations=30", "training.test_points=0", "rasterizer=compiled")
 """Run that fills the cache: compiled code, poses, pictures."""
+PLANNED = ("backbone.capacity=budget", "backbone.budget.primitives=10000")
+"""Options of planned runs that need other code."""
 EVALUATION = ("eval.zoom=[1,2,4]", "eval.pairs=0", "eval.flight=false", "metrics.perceptual=[]")
 """Overrides of `gsx eval`, the same for all arms."""
 AGREEMENT = 0.01
@@ -133,7 +135,8 @@ class Bench:
 
     def warm_up(self, arm: str, scene: str) -> None:
         """Fills the cache of an arm of gsx."""
-        self.train(arm, scene, WARM, self.folder("warm", scene, arm))
+        words = (*WARM, *PLANNED) if arm == NOW else WARM
+        self.train(arm, scene, words, self.folder("warm", scene, arm))
 
 
 def opensplat_words(arm: str, steps: int) -> list[str]:
