@@ -78,8 +78,9 @@ def measured(scene: str, backbone: str, minutes: float, options: argparse.Namesp
     folder = options.runs / f"{scene}_{backbone}_{minutes:g}_{cache}"
     words = [*words_of(scene, options.scenes), f"backbone={backbone}", f"minutes={minutes:g}"]
     with tempfile.TemporaryDirectory() as empty:
-        places = {"GSX_CACHE": empty, "TMPDIR": empty, "TORCHINDUCTOR_CACHE_DIR": ""} if options.cold else {}
-        train(folder, words, {key: value for key, value in places.items() if value}, folder.with_suffix(".log"))
+        keys = ("GSX_CACHE", "TMPDIR", "TORCHINDUCTOR_CACHE_DIR") if options.cold else ()
+        places = dict.fromkeys(keys, empty)
+        train(folder, words, places, folder.with_suffix(".log"))
     return {"scene": scene, "backbone": backbone, "cache": cache, "minutes": minutes} | figures(folder)
 
 

@@ -204,7 +204,7 @@ def planned_steps(bench: Bench, arm: str, scene: str, minutes: float) -> int:
     if same := [row["steps"] for row in rows if row["minutes"] == minutes]:
         return same[0]
     timed = [(row["steps"], row["seconds"]) for row in rows]
-    for steps in PROBES[arm] if len(timed) < 2 else ():
+    for steps in PROBES[arm] if len({length for length, _ in timed}) < 2 else ():
         timed.append((steps, run_arm(bench, arm, scene, f"probe_{steps}", steps, 0, 0)["seconds"]))
     return steps_for(60 * minutes, timed)
 

@@ -32,7 +32,7 @@ from gsx.core.training.render import render, render_gaussians
 from gsx.core.training.run import Run
 from gsx.engine.processes import processes
 from gsx.engine.threads import watch_cores
-from gsx.experiments.minutes.planned import planned
+from gsx.experiments.minutes.planned import planned, without_length
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import evaluate_again
 from gsx.experiments.runs.export import export, refuse_export
@@ -190,7 +190,7 @@ def train(*words: str, **values: Any) -> TrainedRun:
     for word in words:
         if not (isinstance(word, str) and is_override(word) and not word.startswith("-")):
             raise ConfigError(f"gsx.train cannot use {word!r}: give settings, for example 'scene=colmap'")
-    overrides, folders = [*words, *words_of(values)], list[Path]()
+    overrides, folders = without_length([*words, *words_of(values)]), list[Path]()
     if is_table(overrides) or processes() > 1:
         raise ConfigError("gsx.train trains one run in one process: tables and torchrun are for the command line")
     settings = planned(compose(overrides, loaded := plugins()), overrides, loaded)

@@ -61,21 +61,31 @@ def test_a_milestone_is_not_skipped() -> None:
 
 
 def test_the_last_stretch_shrinks_to_what_is_left() -> None:
-    """Measured from step 800 on: 0.5 s a step. After 8 steps 192 are left, 96 s, and 66 s for them: 132 steps."""
+    """0.5 s a step from step 800 on. After 8 steps 192 are left, 96 s, 30 s too many: 59 whole steps are skipped."""
     deadline = deadline_of()
     assert deadline.before_step(run_at(800, 70.0)) == {}
     run = run_at(808, 74.0)
     metrics = deadline.before_step(run)
-    assert run.step == 1000 - 132
+    assert run.step == 808 + 59
     assert metrics["late_from"] == 809
 
 
 def test_half_of_the_last_stretch_is_always_taken() -> None:
+    """Of 200 steps at most 100 are skipped, however late the run is, and not again after those."""
     deadline = deadline_of()
     deadline.before_step(run_at(800, 130.0))
     run = run_at(810, 139.0)
     deadline.before_step(run)
-    assert run.step == 1000 - 95
+    assert run.step == 910
+    deadline.before_step(run_at(911, 150.0))
+    run = run_at(920, 160.0)
+    assert deadline.before_step(run) == {}
+    assert run.step == 920
+
+
+def test_the_last_step_is_not_skipped() -> None:
+    with pytest.raises(ConfigError, match="ends at step 1000 of 1000: the last step is always taken"):
+        build_module(Deadline, DeadlineOptions(skip=[900, 1000]))
 
 
 def test_a_run_of_another_length_has_no_deadline() -> None:

@@ -42,6 +42,7 @@ logger = logging.getLogger("gsx.cli")
 
 def train(words: list[str]) -> int:
     """Train one run, several (`-m`) or a table, or let Hydra print something, by the words of the command line."""
+    words = without_length(with_default_time(words) if trains_photos(words) else words)
     several = bool({"-m", "--multirun"} & set(words))
     if several:
         return train_several(words)
@@ -50,11 +51,16 @@ def train(words: list[str]) -> int:
     if is_table(words):
         return fill_table(words)
     folders: list[Path] = []
-    words = without_length(with_default_time(words) if "scene=photos" in words else words)
-    settings = planned(compose(words, loaded := plugins()), words, loaded, process_start())
-    code = job.train(settings, loaded, folders)
+    with in_use():
+        settings = planned(compose(words, loaded := plugins()), words, loaded, process_start())
+        code = job.train(settings, loaded, folders)
     log_time(settings, code, time.monotonic() - process_start())
     return print_report(code, folders[0])
+
+
+def trains_photos(words: Sequence[str]) -> bool:
+    """Return True for words that train one run on photos."""
+    return "scene=photos" in words and not any(word.startswith("-") for word in words) and not is_table(words)
 
 
 def log_time(settings: Settings, code: int, seconds: float) -> None:

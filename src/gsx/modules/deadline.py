@@ -4,6 +4,7 @@
 """
 
 import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any
@@ -11,6 +12,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from gsx.core.errors import ConfigError
 from gsx.core.ranges import MOST_STEPS, Range, Seconds, Share, Steps
 from gsx.core.training.module import ModuleContext, TrainingModule
 from gsx.core.training.run import Run
@@ -23,7 +25,7 @@ MEASURED = 8
 SLACK = 0.03
 """Share of the planned time by which the last stretch may be late before steps are skipped there."""
 LEAST_END = 0.5
-"""Share of the steps left in the last stretch that is always taken."""
+"""Share of the last stretch that is always taken."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,9 +61,15 @@ class Deadline(TrainingModule):
     """A limit of training time."""
 
     options: DeadlineOptions
+    off = "seconds=0"
 
     def __init__(self, options: DeadlineOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
+        if options.skip and options.skip[-1] >= context.iterations:
+            raise ConfigError(
+                f"training.deadline.skip ends at step {options.skip[-1]} of {context.iterations}: the last step is "
+                "always taken, give lower numbers"
+            )
         self.active = options.seconds > 0 and options.steps == context.iterations and not options.skip
         """True: the clock may skip steps."""
         self.last_stretch = round(options.to * context.iterations)
@@ -157,7 +165,12 @@ class Deadline(TrainingModule):
         if late <= SLACK * self.options.seconds:
             return 0
         left = self.context.iterations - step
-        return self.context.iterations - max(round(left * (1 - late / needed)), round(left * LEAST_END), 1)
+        return step + min(math.floor(left * late / needed), self.room_at_end())
+
+    def room_at_end(self) -> int:
+        """Returns how many more steps of the last stretch may be skipped."""
+        length = self.context.iterations - self.last_stretch
+        return math.floor((1 - LEAST_END) * length) - sum(step >= self.last_stretch for step in self.skipped)
 
     def planned_until(self, step: int) -> float:
         """Returns the planned seconds of the first steps."""

@@ -9,7 +9,7 @@ from tiny import composed
 from gsx.core.errors import ConfigError
 from gsx.experiments.minutes.cost import Measurement
 from gsx.experiments.minutes.options import plan_options
-from gsx.experiments.minutes.plan import Task, changes_of, plan_run, training_seconds
+from gsx.experiments.minutes.plan import Task, changes_of, drawn_pixels, plan_run, training_seconds
 
 MEASURED = Measurement(
     base=0.01,
@@ -116,3 +116,26 @@ def test_short_runs_have_events_within_a_pass_over_the_views() -> None:
     short, long = (replace(plan_run(task_of(600.0)), steps=steps) for steps in (200, 2000))
     assert changes_of(task, short)["backbone.density.passes"] == pytest.approx(200 * 0.4833 / 8 / 40, abs=0.005)
     assert changes_of(task, long)["backbone.density.passes"] == 1
+
+
+@pytest.mark.parametrize("words", [("scene.max_width=800",), ("scene.downscale=8",)])
+def test_a_size_that_is_chosen_elsewhere_stays(words: tuple[str, ...]) -> None:
+    task = task_of(600.0, *(word.partition("=")[0] for word in words if "width" in word), words=words)
+    assert plan_run(task).downscale == 4
+    assert "scene.downscale" not in changes_of(task, plan_run(task))
+
+
+def test_a_cap_of_primitives_is_kept() -> None:
+    task = task_of(600.0, words=("backbone.max_primitives=900",))
+    assert changes_of(task, plan_run(task))["backbone.budget.primitives"] == 900
+
+
+def test_augmenters_keep_their_finer_renders() -> None:
+    task = task_of(600.0, words=("augmenter=[mipmap]",))
+    assert "training.supersampling.start" not in changes_of(task, plan_run(task))
+
+
+def test_zooms_without_photos_cost_nothing() -> None:
+    """At 1/4 size, zooms 1, 2 and 4 draw 1 + 4 + 16 x1 pictures, at 1/2 size 1 + 4, at full size 1."""
+    task = task_of(600.0, words=("eval.zoom=[1,2,4]",))
+    assert [drawn_pixels(task, downscale) for downscale in (4, 2, 1)] == [21, 5, 1]

@@ -1,6 +1,7 @@
 """minutes=N from words to a trained run: measured, planned, repeated to the same bits; refused combinations."""
 
 import json
+import logging
 import re
 from pathlib import Path
 
@@ -9,8 +10,12 @@ import torch
 from tiny import OVERRIDES, final_tensors
 
 from gsx.builtin import plugins
-from gsx.core.errors import ConfigError
+from gsx.core.errors import CompilerError, ConfigError, InputError
+from gsx.core.training.run import Run
+from gsx.experiments.minutes import probe
+from gsx.experiments.minutes.options import plan_options
 from gsx.experiments.minutes.planned import keys_of, planned, refuse_resumed, with_default_time, without_length
+from gsx.experiments.minutes.probe import measure, quiet
 from gsx.experiments.runs import job
 from gsx.experiments.runs.compose import compose
 
@@ -30,7 +35,7 @@ def test_a_planned_run_and_its_repetition(tmp_path: Path) -> None:
     assert 0 < facts["training_s"] < 1800
     assert facts["measurement"]["primitives"] <= 120
     late = json.loads((tmp_path / "planned" / "evaluation.json").read_text()).get("late", [])
-    again = [word for word in facts["repeat"] if not word.startswith("folder=")]
+    again = facts["repeat"]
     skip = [f"training.deadline.skip=[{','.join(str(round(step)) for step in late)}]"]
     repeated = compose([*again, *skip, f"folder={tmp_path / 'repeated'}"], loaded)
     job.train(repeated, loaded, [])
@@ -53,6 +58,8 @@ def test_settings_without_minutes_stay() -> None:
     [
         (["minutes=5", "iterations=100"], "minutes=N chooses the number of steps, and iterations does, too"),
         (["seconds=90", "budget=quick"], "seconds=N chooses the number of steps, and budget does, too"),
+        (["minutes=5", "scene.iterations=9"], "minutes=N chooses the number of steps, and scene.iterations does, too"),
+        (["minutes=5", "init=model.ply"], "minutes=N plans models that begin with the scene"),
         (["minutes=5", "reuse=true"], "reuse=true names the folder by the settings"),
         (["minutes=5", "seconds=5"], "minutes is 5 and seconds 5: give one of them"),
         (["minutes=-1"], "minutes is -1"),
@@ -77,6 +84,35 @@ def test_a_run_that_exists_is_not_planned() -> None:
     refuse_resumed(["iterations=5"])
 
 
+def test_a_used_folder_is_refused_before_anything_is_measured(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "mine.txt").touch()
+    words, loaded = [*WORDS, "minutes=5", f"folder={tmp_path / 'run'}"], plugins()
+    with pytest.raises(InputError, match="is not empty"):
+        planned(compose(words, loaded), words, loaded)
+
+
+def test_a_failing_compiler_leaves_the_eager_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(run: Run) -> None:
+        raise CompilerError("no compiler")
+
+    monkeypatch.setattr(probe, "warm", fail)
+    words, loaded = [word for word in WORDS if word != "rasterizer=eager"], plugins()
+    settings = compose([*words, f"folder={tmp_path}"], loaded)
+    measurement, _ = measure(settings, {}, plan_options().probe, loaded)
+    assert measurement.path == "eager"
+
+
+def test_messages_come_back_as_they_were() -> None:
+    logging.disable(logging.WARNING)
+    try:
+        with quiet():
+            assert logging.root.manager.disable == logging.WARNING
+        assert logging.root.manager.disable == logging.WARNING
+    finally:
+        logging.disable(logging.NOTSET)
+
+
 def test_keys_of_words() -> None:
     assert keys_of(["a.b=1", "+c=2", "scene=demo"]) == {"a.b", "c", "scene"}
 
@@ -87,7 +123,13 @@ def test_photos_have_a_default_time_on_a_cpu(more: list[str]) -> None:
     assert with_default_time(words) == [*words, "minutes=10"]
 
 
-@pytest.mark.parametrize("word", ["length=published", "iterations=5", "minutes=3", "seconds=9", "variant=mip_ub"])
+@pytest.mark.parametrize(
+    "word",
+    [
+        *("length=published", "iterations=5", "minutes=3", "seconds=9", "variant=mip_ub"),
+        *("preset=zoom_prior", "augmenter=[upscale]", "protocol=zoom_in", "reuse=true", "scene.iterations=5"),
+    ],
+)
 def test_a_chosen_length_stays(word: str) -> None:
     words = ["device=cpu", "scene=photos", word]
     assert with_default_time(words) == words

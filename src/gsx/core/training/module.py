@@ -39,6 +39,8 @@ class TrainingModule:
 
     in_views: ClassVar[bool] = False
     """True: views passed on to another run contain the corrections, so `restarted` must not repeat them."""
+    off: ClassVar[str] = "when=never"
+    """Override below `training.NAME` that switches the module off."""
     skipped: Container[int] = range(0)
     """Steps that the module skipped."""
 

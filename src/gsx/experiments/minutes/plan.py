@@ -11,7 +11,8 @@ from gsx.experiments.minutes.cost import Growth, Measurement, StepCost, planned_
 from gsx.experiments.minutes.options import CostOptions, PlanOptions
 from gsx.experiments.runs.settings import Settings
 
-SIZE, CAPACITY, BUDGET = "scene.downscale", "backbone.capacity", "backbone.budget.primitives"
+SIZE, WIDTH = "scene.downscale", "scene.max_width"
+CAPACITY, BUDGET, MOST = "backbone.capacity", "backbone.budget.primitives", "backbone.max_primitives"
 PATH, PASSES = "rasterizer.path", "backbone.density.passes"
 CHECKS, FINE_FROM = "training.test_points", "training.supersampling.start"
 EVERY = 100
@@ -47,9 +48,19 @@ class Task:
 
 
 def schedule_of(settings: Settings, fixed: frozenset[str], options: PlanOptions) -> dict[str, Any]:
-    """Returns the values of planned runs by dotted key, of keys that the settings have and the user leaves open."""
-    config = flattened(settings.resolved)
-    return {key: value for key, value in options.schedule.items() if key in config and key not in fixed}
+    """Returns the values of planned runs by dotted key, of keys that the settings have and the user leaves open.
+
+    Augmenters may use the finer renders from the first step, so their start stays with any.
+    """
+    config, kept = flattened(settings.resolved), {*fixed, *((FINE_FROM,) if settings.augmenters else ())}
+    return {key: value for key, value in options.schedule.items() if key in config and key not in kept}
+
+
+def chooses_size(settings: Settings, fixed: frozenset[str]) -> bool:
+    """Returns whether a plan may choose the reduction of the photos: nothing else does."""
+    values = flattened(settings.resolved)
+    whole = values.get(SIZE) == 1 and values.get("scene.scales", [1]) == [1]
+    return whole and hasattr(settings.scene.options, "downscale") and not fixed & {SIZE, WIDTH}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +112,7 @@ def too_short(task: Task, shortest: Plan) -> str:
 def sizes_of(task: Task) -> list[int]:
     """Returns the reductions of photos to choose from, finest first; the present one alone if it is fixed."""
     measurement = task.measurement
-    if SIZE in task.fixed or SIZE not in task.values:
+    if not chooses_size(task.settings, task.fixed):
         return [measurement.downscale]
     full = measurement.pixels * measurement.downscale**2
     sizes = [1 << power for power in range(MOST_DOWNSCALE.bit_length())]
@@ -139,8 +150,16 @@ def other_seconds(task: Task, downscale: int) -> float:
     """Returns the seconds of photos, evaluation and report."""
     measurement, larger = task.measurement, pixels_at(task, downscale) / task.measurement.pixels
     checks = task.values[CHECKS] * min(task.tests, CHECKED) * measurement.check
-    drawn = larger * (task.tests * measurement.evaluate + checks)
+    zooms = drawn_pixels(task, downscale) / drawn_pixels(task, measurement.downscale)
+    drawn = larger * (task.tests * zooms * measurement.evaluate + checks)
     return task.views * measurement.photo + drawn + task.options.report
+
+
+def drawn_pixels(task: Task, downscale: int) -> float:
+    """Returns the pixels that are drawn of a test view at all zooms that photos have, in pixels at x1."""
+    if SIZE not in task.values:
+        return 1.0
+    return 1.0 + sum(zoom**2 for zoom in task.settings.evaluation.zoom if zoom != 1 and zoom <= downscale)
 
 
 def training_seconds(task: Task, downscale: int, steps: int) -> list[float]:
@@ -169,6 +188,7 @@ def growth_of(task: Task, downscale: int, steps: int) -> Growth:
     last = min(target, first + options.most_growth * steps / 1000)
     if values.get(CAPACITY) == "budget" and CAPACITY in task.fixed:
         last = values[BUDGET]
+    last = min(last, values.get(MOST) or last)
     start, stop = growth_window(task)
     events = events_of(task, steps)
     return Growth(first=first, last=max(1, round(last)), start=start, stop=stop, power=0.5, events=events)
@@ -179,7 +199,7 @@ def events_of(task: Task, steps: int) -> float:
     start, stop = growth_window(task)
     growing = steps * (stop - start)
     every = max(task.views, EVERY * steps / task.published)
-    return max(growing / every, min(growing, task.options.events))
+    return max(growing / every, min(growing, task.options.events) if PASSES in task.values else 0.0)
 
 
 def rows_of(task: Task) -> float:
@@ -202,7 +222,7 @@ def changes_of(task: Task, plan: Plan) -> Mapping[str, Any]:
     values, fixed = task.values, task.fixed
     changes = schedule_of(task.settings, fixed, task.options)
     changes |= {"iterations": plan.steps, PATH: task.measurement.path}
-    if SIZE in values and SIZE not in fixed:
+    if chooses_size(task.settings, fixed):
         changes[SIZE] = plan.downscale
     changes |= capacity_of(values, fixed, plan.primitives)
     if PASSES in values and PASSES not in fixed:
@@ -214,7 +234,7 @@ def capacity_of(values: Mapping[str, Any], fixed: frozenset[str], primitives: in
     """Returns the values by which a run grows to a number of primitives; empty: its growth is chosen, or fixed."""
     if values.get(CAPACITY) != "published" or CAPACITY in fixed:
         return {}
-    return {CAPACITY: "budget", BUDGET: primitives}
+    return {CAPACITY: "budget", BUDGET: min(primitives, values.get(MOST) or primitives)}
 
 
 def passes_of(task: Task, plan: Plan) -> float:

@@ -13,11 +13,23 @@ from gsx.core.plugins import Plugins
 from gsx.engine.processes import processes
 from gsx.experiments.minutes.options import PlanOptions, plan_options
 from gsx.experiments.minutes.overriding import overridden
-from gsx.experiments.minutes.plan import SIZE, Plan, Task, capacity_of, changes_of, plan_run, schedule_of
+from gsx.experiments.minutes.plan import (
+    SIZE,
+    WIDTH,
+    Plan,
+    Task,
+    capacity_of,
+    changes_of,
+    chooses_size,
+    plan_run,
+    schedule_of,
+)
 from gsx.experiments.minutes.probe import LENGTH, measure
+from gsx.experiments.run_folder.general_options import splat_file
 from gsx.experiments.runs.build import choose_device
 from gsx.experiments.runs.early_compiling import compiling_before
 from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.open import refuse_early
 from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -25,8 +37,10 @@ logger = logging.getLogger(__name__)
 MANY = 10**6
 """Primitives of a budget that is not planned yet: its code is compiled and measured."""
 TIMES = ("minutes", "seconds")
-LENGTHS = ("iterations", "length", "budget", "budget.share")
+LENGTHS = ("iterations", "length", "budget", "budget.share", "scene.iterations")
 """Keys that choose the number of steps."""
+OWN_LENGTH = ("variant", "dataset", "protocol", "preset", "augmenter", "init", "reuse")
+"""Keys of runs without a default time: published settings, what is not measured, and names by settings."""
 PUBLISHED = "length=published"
 """Word for the steps of the published run."""
 
@@ -38,7 +52,7 @@ def keys_of(words: Iterable[str]) -> frozenset[str]:
 
 def with_default_time(words: Sequence[str]) -> list[str]:
     """Returns words that train on photos, with the default minutes on a CPU unless they choose a length."""
-    chosen = keys_of(words) & {*TIMES, *LENGTHS, "variant", "dataset", "init"}
+    chosen = keys_of(words) & {*TIMES, *LENGTHS, *OWN_LENGTH}
     if chosen or processes() > 1 or not on_cpu(words):
         return list(words)
     return [*words, f"minutes={plan_options().default:g}"]
@@ -46,7 +60,7 @@ def with_default_time(words: Sequence[str]) -> list[str]:
 
 def without_length(words: Sequence[str]) -> list[str]:
     """Returns words without PUBLISHED: nothing else is the length of the published run."""
-    return [word for word in words if word != PUBLISHED]
+    return [word for word in words if word.replace("'", "") != PUBLISHED]
 
 
 def on_cpu(words: Iterable[str]) -> bool:
@@ -73,12 +87,13 @@ def planned(settings: Settings, words: Sequence[str], loaded: Plugins, started: 
         return settings
     started, fixed, options = time.monotonic() if started is None else started, keys_of(words), plan_options()
     refuse(settings, fixed)
+    refuse_early(settings)
     changes = schedule_of(settings, fixed, options) | capacity_of(flattened(settings.resolved), fixed, MANY)
     with compiling_before(overridden(settings, changes | {"iterations": LENGTH}, loaded)):
         task = task_of(settings, fixed, changes, limit - (time.monotonic() - started), options, loaded)
     plan = plan_run(task)
     changes = {"minutes": 0.0, "seconds": 0.0, **changes_of(task, plan)}
-    again = [word for word in words if word.partition("=")[0] not in TIMES]
+    again = [word for word in words if word.partition("=")[0] not in (*TIMES, "folder")]
     again += [f"{key}={text_of(value)}" for key, value in changes.items() if key not in TIMES and not of_clock(key)]
     announce(task, plan, limit, time.monotonic() - started, again)
     facts = facts_of(task, plan, limit, time.monotonic() - started)
@@ -119,6 +134,8 @@ def refuse(settings: Settings, fixed: frozenset[str]) -> None:
             f"{name}=N plans by the speed of this machine, and reuse=true names the folder by the settings: leave one "
             "of them out, or run the command that the plan logs with reuse=true"
         )
+    if splat_file(settings.general.init):
+        raise ConfigError(f"{name}=N plans models that begin with the scene: give iterations=N with init=FILE")
     if processes() > 1:
         raise ConfigError(f"{name}=N plans for one process: call gsx without torchrun, or give iterations=N")
 
@@ -142,7 +159,7 @@ def task_of(
         loaded: Plugins.
     """
     start = time.monotonic()
-    downscale = probe_downscale(settings, fixed, options)
+    downscale = probe_downscale(settings, fixed, options, loaded)
     logger.info("measuring a few steps to plan %s ...", in_words(seconds))
     sized = changes if downscale is None else changes | {SIZE: downscale}
     measurement, scene = measure(settings, sized, options.probe, loaded)
@@ -158,11 +175,11 @@ def task_of(
     )
 
 
-def probe_downscale(settings: Settings, fixed: frozenset[str], options: PlanOptions) -> int | None:
+def probe_downscale(settings: Settings, fixed: frozenset[str], options: PlanOptions, loaded: Plugins) -> int | None:
     """Returns the reduction of photos to measure at, which are small pictures; None: as the settings have it."""
-    if not hasattr(settings.scene.options, "downscale") or SIZE in fixed:
+    if not chooses_size(settings, fixed):
         return None
-    camera = load_scene(settings).train[0].camera
+    camera = load_scene(overridden(settings, {SIZE: 1, WIDTH: 0}, loaded)).train[0].camera
     factor = math.sqrt(camera.width * camera.height / options.probe.pixels)
     return 1 << max(0, math.ceil(math.log2(factor)))
 
@@ -170,10 +187,11 @@ def probe_downscale(settings: Settings, fixed: frozenset[str], options: PlanOpti
 def announce(task: Task, plan: Plan, limit: float, used: float, again: Sequence[str]) -> None:
     """Logs the plan, what to choose instead, and the command for the same bits."""
     size = f" at 1/{plan.downscale} size" if plan.downscale > 1 else ""
+    grown = f", up to {plan.primitives:,} primitives" if capacity_of(task.values, task.fixed, 1) else ""
     logger.info(
-        "about %s: %s steps%s, up to %s primitives; minutes=%g for more, %s for %s steps",
-        *(in_words(used + plan.seconds), f"{plan.steps:,}", size, f"{plan.primitives:,}"),
-        *(math.ceil(3 * limit / 60), PUBLISHED, f"{task.published:,}"),
+        "about %s: %s steps%s%s; minutes=%g for more, %s for %s steps",
+        *(in_words(used + plan.seconds), f"{plan.steps:,}", size, grown),
+        *(math.ceil(3 * limit / 60), PUBLISHED, f"{task.settings.general.iterations:,}"),
     )
     logger.info("the same training without a clock: %s", command(*again))
 

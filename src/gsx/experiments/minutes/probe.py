@@ -12,6 +12,7 @@ from typing import Any
 
 from gsx.core.data.scene import Scene, View
 from gsx.core.device import clock
+from gsx.core.errors import CompilerError
 from gsx.core.plugins import Plugins, load_plugins
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -28,6 +29,8 @@ from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.settings import Settings
 
+logger = logging.getLogger(__name__)
+
 LENGTH = 30_000
 """Steps of the run that is measured: its schedules change nothing within the first steps."""
 COARSE = 2
@@ -41,11 +44,12 @@ LEAST = 0.1
 @contextmanager
 def quiet() -> Iterator[None]:
     """Holds back messages of runs that are only measured."""
-    logging.disable(logging.INFO)
+    before = logging.root.manager.disable
+    logging.disable(max(before, logging.INFO))
     try:
         yield
     finally:
-        logging.disable(logging.NOTSET)
+        logging.disable(before)
 
 
 def measure(
@@ -60,10 +64,10 @@ def measure(
         loaded: Plugins.
     """
     short = replace(overridden(settings, dict(changes) | probe_changes(options), loaded), augmenters={})
+    scene = load_scene(short)
     with quiet():
-        scene = load_scene(short)
         run = build(short, replace(scene, train=evenly(scene.train, options.steps)), Path(), training=True)
-    warm(run)
+    warm_or_eager(run, settings)
     photo = median_seconds(run, run.photos.of, run.scene.train)
     for view in run.views.at(1):
         run.photos.of(view)
@@ -90,7 +94,18 @@ def probe_changes(options: ProbeOptions) -> dict[str, Any]:
     """Returns the options of the measured run by dotted key: coarse views first, then the photos' size."""
     until = (options.warm + options.steps) / LENGTH
     coarse = {"training.coarse_to_fine.factor": COARSE, "training.coarse_to_fine.until": until}
-    return {"iterations": LENGTH, **coarse}
+    return {"iterations": LENGTH, "training.supersampling.factor": 1, **coarse}
+
+
+def warm_or_eager(run: Run, settings: Settings) -> None:
+    """Compiles what steps need; a run that leaves the path to gsx is eager if that fails."""
+    try:
+        warm(run)
+    except CompilerError as error:
+        if settings.raster.path != "auto":
+            raise
+        logger.warning("%s; using the eager path, which is several times slower", error)
+        run.raster = run.backbone.raster = replace(run.raster, path="eager")
 
 
 def seconds_of(run: Run, use: Callable[[], object]) -> float:

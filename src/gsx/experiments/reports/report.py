@@ -140,7 +140,10 @@ def minutes_of(run: RunFiles) -> dict[str, Any]:
     words, numbers = plan.get("repeat"), [plan.get(key) for key in ("limit_s", "steps", "training_s")]
     if not (isinstance(words, list) and all(isinstance(word, str) for word in words) and all(map(is_number, numbers))):
         return {}
-    return plan | {"command": command(*words)}
+    late = run.evaluation.get("late")
+    if isinstance(late, list) and late and all(map(is_number, late)):
+        words = [*words, f"training.deadline.skip=[{','.join(f'{step:.0f}' for step in late)}]"]
+    return plan | {"command": command(*words)} if plan["steps"] == run.iterations else {}
 
 
 def embedded(path: Path) -> str | None:

@@ -72,7 +72,7 @@ def refuse_shared(modules: Modules, ranks: Ranks) -> None:
         if not module.supports(ranks.size):
             raise ConfigError(
                 f"training.{name} works in one process, and {ranks.size} train together: switch it off "
-                f"(training.{name}.when=never), or start gsx without torchrun"
+                f"(training.{name}.{module.off}), or start gsx without torchrun"
             )
 
 

@@ -84,6 +84,18 @@ def stamped_folder(parent: Path) -> Path:
     raise InputError(f"no free folder below {parent}: clean it up or set folder=NEW_FOLDER")
 
 
+def refuse_early(settings: Settings) -> None:
+    """Raise ConfigError or InputError for settings that cannot train, before the scene is loaded."""
+    ranks = current_ranks()
+    choose_device(settings.general.device)
+    ranks.broadcast(lambda: refuse_used(settings.general.folder))
+    refuse_uneven(settings.training.batch, ranks)
+    load_lpips(settings.evaluation.lpips)  # refuses wrong weights now, not after training
+    build_trackers(settings.trackers)  # the same for a missing package
+    if settings.general.viewer:
+        require("viewer=true", ("viser",), "gsx[viewer]")
+
+
 @gc_paused()
 def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None) -> Run:
     """Load the scene and build a run in a new folder, with config.yaml and environment.json.
@@ -94,13 +106,7 @@ def start(settings: Settings, plugins: Plugins, claims: ExitStack | None = None)
         ConfigError, InputError: a setting or the scene is wrong; no folder was made.
     """
     ranks = current_ranks()
-    choose_device(settings.general.device)  # refuses an unknown one before the scene is loaded
-    ranks.broadcast(lambda: refuse_used(settings.general.folder))
-    refuse_uneven(settings.training.batch, ranks)
-    load_lpips(settings.evaluation.lpips)  # refuses wrong weights now, not after training
-    build_trackers(settings.trackers)  # the same for a missing package
-    if settings.general.viewer:
-        require("viewer=true", ("viser",), "gsx[viewer]")
+    refuse_early(settings)
     content = starting_splats(settings)
     if claims is not None:
         claims.enter_context(compiling_before(settings))

@@ -35,6 +35,8 @@ TAKEN = {
     "variant": "experiment.only=[ROW,...] chooses rows",
     "dataset.scene": "experiment.scenes=[NAME,...] chooses scenes",
     "reuse": "leave it out",
+    "minutes": "budget=quick or iterations=N shortens all runs alike",
+    "seconds": "budget=quick or iterations=N shortens all runs alike",
     "init": "leave it out",
     "warm_start_at": "leave it out",
     "folder": "output=FOLDER",
