@@ -20,6 +20,7 @@ import torch
 
 from gsx.core.files import read_json
 from gsx.experiments.minutes.cost import MILLION
+from gsx.experiments.minutes.options import plan_options
 from gsx.experiments.run_folder.files import read_lines
 from measuring.machine import commit, describe_machine, shown_command, told_load
 from measuring.results import Section, read_sections, stamped, text_table, write_results
@@ -116,13 +117,14 @@ def observations(folder: Path) -> Iterator[tuple[float, float, float, float]]:
     """Yields (seconds, pixels, rows, measured seconds of a pixel) of a step between two lines of metrics.jsonl."""
     config, plan = read_json_of(folder), plan_of(folder)
     measurement, pixels = plan["measurement"], pixels_of(folder)
+    lasting = plan_options().cost.of(measurement["device"]).random if measurement["random"] else 1.0
     lines = [line for line in read_lines(folder / "metrics.jsonl", {}) if "late_from" not in line]
     for before, after in itertools.pairwise(lines):
         steps = after["step"] - before["step"]
         if steps >= 5:
             scale = scale_at(config, after["step"])
             seconds = (after["seconds"] - before["seconds"]) / steps
-            yield seconds, pixels * scale**2, after["primitives"], measurement["megapixel"] / MILLION
+            yield seconds, pixels * scale**2, after["primitives"], lasting * measurement["megapixel"] / MILLION
 
 
 def read_json_of(folder: Path) -> Mapping[str, Any]:
