@@ -42,7 +42,7 @@ def test_fields_inside_count_too() -> None:
 
 def test_keys_that_change_no_training_are_those_that_are_written_down() -> None:
     """As they stood in one list before every field said it of itself."""
-    viewer = ("viewer", "viewer_host", "viewer_port", "viewer_share")  # newer than that list
+    viewer = ("viewer", "viewer_host", "viewer_port", "viewer_share", "minutes", "seconds")  # newer than that list
     assert sorted(WHERE) == sorted(
         (
             "folder",
