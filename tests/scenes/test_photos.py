@@ -85,7 +85,8 @@ def test_scene_tells_what_became_of_the_photos(reconstructed: tuple[Scene, Path]
     scene = reconstructed[0]
     assert scene.name == "garden"
     assert any(note.startswith(f"Reconstructed {FRAMES} of {FRAMES + 1} photos: ") for note in scene.notes)
-    assert f"Photos that could not be placed are not used (1): {STRANGER}." in scene.notes
+    lost = f"1 of {FRAMES + 1} photos (17%) could not be placed and are not used: {STRANGER}. What would help: a larger"
+    assert scene.notes[0].startswith(lost)
     assert scene.provenance["format"] == "photos"
     assert scene.provenance["sfm"]["max_features"] == 4096
     assert scene.train[0].image().shape[0] == 3
@@ -395,24 +396,45 @@ def test_portraits_that_a_tool_turned_join_the_landscapes_of_their_lens(tmp_path
     assert photos.turned_already(tmp_path, alone, "auto") == {}
 
 
-@pytest.mark.parametrize(("count", "matcher"), [(2, "auto"), (9, "auto"), (3, "sequential"), (9, "sequential")])
-def test_pairs_are_counted_as_colmap_makes_them(tmp_path: Path, count: int, matcher: str) -> None:
-    chosen = options(tmp_path, matcher=matcher, overlap=3)
-    for number in range(count):
-        write_image(tmp_path / f"{number}.png", torch.zeros(3, 8, 8))
+@pytest.mark.parametrize("count", [2, 3, 9])
+@pytest.mark.parametrize("kind", ["exhaustive", "sequential", "near"])
+def test_pairs_are_counted_as_colmap_makes_them(tmp_path: Path, count: int, kind: str) -> None:
+    chosen = options(tmp_path, overlap=3, near=4)
     sizes = {f"{number}.png": (8, 8) for number in range(count)}
+    for name in sizes:
+        write_image(tmp_path / name, torch.zeros(3, 8, 8))
     sfm.import_photos(tmp_path / "database.db", tmp_path, sizes, options(tmp_path))
-    generators = {"exhaustive": pycolmap.ExhaustivePairGenerator, "sequential": pycolmap.SequentialPairGenerator}
-    kind = sfm.chosen_matcher(count, chosen)
+    every = kind == "exhaustive"
+    generator = pycolmap.ExhaustivePairGenerator if every else pycolmap.SequentialPairGenerator
     with pycolmap.Database.open(tmp_path / "database.db") as database:
-        pairs = generators[kind](sfm.pairing_options(kind, 3), database).all_pairs()
-    assert sfm.pair_count(count, chosen) == len({tuple(sorted(pair)) for pair in pairs})
+        pairs = generator(sfm.pairing_options(kind, chosen), database).all_pairs()
+    assert sfm.pair_count(kind, count, chosen) == len({tuple(sorted(pair)) for pair in pairs})
 
 
 def test_auto_gives_up_on_every_pair_beyond_the_limit(tmp_path: Path) -> None:
     chosen = options(tmp_path, exhaustive_limit=20)
-    assert [sfm.chosen_matcher(count, chosen) for count in (20, 21)] == ["exhaustive", "sequential"]
+    assert [sfm.chosen_matcher(count, chosen) for count in (20, 21)] == ["exhaustive", "retrieval"]
     assert sfm.chosen_matcher(21, options(tmp_path, matcher="exhaustive")) == "exhaustive"
+    assert sfm.pair_count("similar", 5, options(tmp_path, similar=3)) == 10  # there are no more
+    assert sfm.pair_count("similar", 9, options(tmp_path, similar=3)) == 27
+
+
+def test_options_without_effect_change_no_kept_reconstruction(tmp_path: Path) -> None:
+    """Keys of reconstructions that were made before there was retrieval."""
+    older = {
+        "matcher", "exhaustive_limit", "overlap", "max_feature_size", "max_features", "camera_mode", "camera_model",
+        "mapping_threads", "seed",
+    }  # fmt: skip
+    assert photos.settings(options(tmp_path), 100).keys() == older
+    assert photos.settings(options(tmp_path), 101).keys() == older - {"overlap"} | {"similar", "near", "retry_pairs"}
+    assert photos.settings(options(tmp_path, matcher="sequential"), 9).keys() == older | {"retry_pairs"}
+
+
+def test_lost_photos_are_named_with_their_share_and_a_remedy_that_is_left() -> None:
+    note = photos.lost_photos(["a.jpg", "c d.jpg"], 8, "retrieval")
+    assert note.startswith("2 of 8 photos (25%) could not be placed and are not used: a.jpg, c d.jpg. ")
+    assert "scene.matcher=exhaustive" in note
+    assert "scene.matcher" not in photos.lost_photos(["a.jpg"], 8, "exhaustive")
 
 
 def test_progress_is_logged_with_stage_count_and_time(

@@ -9,17 +9,19 @@ process, and each of the two drops the other's file locks.
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from itertools import count as count_from
 from pathlib import Path
 from typing import Annotated, Any
 
 from gsx.core.errors import InputError
 from gsx.core.ranges import Count, Range
 from gsx.scenes.exif import lens_of
+from gsx.scenes.vocabulary import learn_vocabulary
 
 logger = logging.getLogger(__name__)
 
@@ -27,6 +29,17 @@ Sizes = Mapping[str, tuple[int, int]]
 """(width, height) by name of photo, relative to their folder."""
 
 LOG_SECONDS = 10.0  # between progress lines
+INDEXED = 1000  # largest features of each photo by which similar ones are retrieved
+COLMAP_MATCHERS = {
+    "exhaustive": "exhaustive", "sequential": "sequential", "near": "sequential", "similar": "vocabtree",
+}  # fmt: skip
+UNUSED = {
+    "exhaustive": ("similar", "near", "retry_pairs"), "sequential": ("similar", "near"), "retrieval": ("overlap",),
+}  # fmt: skip
+"""Options without effect, by matcher."""
+STAGES = dict.fromkeys(("exhaustive", "sequential"), "matches of pairs") | {
+    "near": "matches of neighbours by name", "similar": "matches of similar photos",
+}  # fmt: skip
 PAIR_BLOCK = 10  # photos whose pairs COLMAP matches before it writes them down: steps of progress
 
 
@@ -35,11 +48,18 @@ class SfmOptions:
     """Options of a reconstruction; values and sources in `conf/scene/photos.yaml`."""
 
     matcher: str
-    """auto | exhaustive (every pair) | sequential (neighbours in order of name: video frames, walks)."""
+    """auto | exhaustive (every pair) | sequential (neighbours in order of name: video frames, walks) | retrieval
+    (similar photos, and the nearest neighbours in order of name)."""
     exhaustive_limit: Count
-    """Number of photos up to which `auto` matches every pair; of more it matches neighbours."""
+    """Number of photos up to which `auto` matches every pair; of more it takes `retrieval`."""
     overlap: Annotated[int, Range(1, 1000)]
     """`sequential` matches photos at the distances 1, 2, 4, ... 2^(overlap - 1) in the sorted list."""
+    similar: Annotated[int, Range(1, 1000)]
+    """`retrieval` matches each photo with this many of the most similar ones."""
+    near: Annotated[int, Range(1, 1000)]
+    """`retrieval` also matches photos up to this distance in the sorted list."""
+    retry_pairs: Annotated[int, Range(0, 10**9)]
+    """Bound on the pairs of each attempt to place remaining photos; 0: no attempt. `exhaustive` needs none."""
     max_feature_size: Annotated[int, Range(16, 1 << 16)]
     """Longer side of the reduced photos on which features are found, px; training is not affected."""
     max_features: Annotated[int, Range(1, 10**6)]
@@ -65,7 +85,12 @@ def reconstruct(folder: Path, sizes: Sizes, options: SfmOptions, work: Path) -> 
         import_photos(database, folder, sizes, options)
         _extract(database, folder, sizes, options)
         _match(database, len(sizes), options)
-        models = _map(database, folder, work / "sparse", len(sizes), options)
+        best = largest(_map(database, folder, work / "sparse", len(sizes), options))
+        return _retry(best, database, folder, sizes, options, work)
+
+
+def largest(models: Mapping[int, Any]) -> Any:
+    """Return the model that places most photos, the first of equals; None if there is none."""
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
 
@@ -121,58 +146,132 @@ def chosen_matcher(count: int, options: SfmOptions) -> str:
     """Return the matcher for a number of photos."""
     if options.matcher != "auto":
         return options.matcher
-    return "exhaustive" if count <= options.exhaustive_limit else "sequential"
+    return "exhaustive" if count <= options.exhaustive_limit else "retrieval"
 
 
-def pair_count(count: int, options: SfmOptions) -> int:
-    """Return the number of pairs of photos to match."""
-    if chosen_matcher(count, options) == "exhaustive":
-        return count * (count - 1) // 2
-    return sum(max(0, count - 2**k) for k in range(options.overlap))
+def pair_count(matcher: str, count: int, options: SfmOptions) -> int:
+    """Return the number of pairs of photos to match, an upper bound for similar photos."""
+    every = count * (count - 1) // 2
+    distances = {
+        "exhaustive": range(1, count),
+        "sequential": [2**k for k in range(options.overlap)],
+        "near": range(1, options.near + 1),
+    }
+    if matcher == "similar":
+        return min(every, count * options.similar)
+    return sum(max(0, count - distance) for distance in distances[matcher])
 
 
 def _match(database: Path, count: int, options: SfmOptions) -> None:
+    """Match features of pairs; `retrieval` does so in two stages."""
+    matcher = chosen_matcher(count, options)
+    for kind in ("near", "similar") if matcher == "retrieval" else (matcher,):
+        if kind == "similar":
+            match_similar(database, options.similar, pair_count(kind, count, options), options)
+        else:
+            match_pairs(database, kind, pairing_options(kind, options), pair_count(kind, count, options), options)
+
+
+def match_pairs(database: Path, kind: str, pairing: Any, total: int, options: SfmOptions) -> int:
+    """Match the pairs that COLMAP's `pairing` options choose, `total` at most; return the number of new ones."""
     import pycolmap
 
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.num_threads = options.num_threads or -1
     matching.use_gpu = False
     verification.ransac.random_seed = options.seed
-    matcher = chosen_matcher(count, options)
     match = partial(
-        getattr(pycolmap, f"match_{matcher}"),
+        getattr(pycolmap, f"match_{COLMAP_MATCHERS[kind]}"),
         database,
         matching_options=matching,
-        pairing_options=pairing_options(matcher, options.overlap),
+        pairing_options=pairing,
         verification_options=verification,
         device=pycolmap.Device.cpu,
     )
     with pycolmap.Database.open(database) as reader:
-        run_stage("matches of pairs", match, reader.num_matched_image_pairs, pair_count(count, options))
+        before = reader.num_matched_image_pairs()
+        run_stage(STAGES[kind], match, lambda: reader.num_matched_image_pairs() - before, total)
+        return reader.num_matched_image_pairs() - before
 
 
-def pairing_options(matcher: str, overlap: int) -> Any:
-    """Return pycolmap's options that choose the pairs to match."""
+def match_similar(database: Path, similar: int, total: int, options: SfmOptions, queries: Sequence[str] = ()) -> int:
+    """Match photos, or only `queries`, with the most similar ones; return the number of new pairs.
+
+    The vocabulary lies next to the database, and is learnt at the first call.
+    """
     import pycolmap
 
-    if matcher == "exhaustive":
+    words = database.with_name("vocabulary.bin")
+    with pycolmap.Database.open(database) as reader:
+        if not words.is_file() and not learn_vocabulary(reader, words, options.seed):
+            logger.warning("sfm: photos have too few features for a vocabulary: similar photos are not matched")
+            return 0
+    pairing = pycolmap.VocabTreePairingOptions()
+    pairing.vocab_tree_path, pairing.num_images = words, similar + 1  # each photo is the most similar to itself
+    pairing.num_nearest_neighbors = 1
+    pairing.max_num_features = INDEXED
+    pairing.num_threads = 1  # the order of similarity depends on it
+    if queries:
+        pairing.match_list_path = database.with_name("queries.txt")
+        pairing.match_list_path.write_text("".join(f"{name}\n" for name in queries), "utf-8")
+    return match_pairs(database, "similar", pairing, total, options)
+
+
+def pairing_options(kind: str, options: SfmOptions) -> Any:
+    """Return pycolmap's options that choose the pairs to match: exhaustive, sequential or near."""
+    import pycolmap
+
+    if kind == "exhaustive":
         every = pycolmap.ExhaustivePairingOptions()
         every.block_size = PAIR_BLOCK
         return every
     neighbours = pycolmap.SequentialPairingOptions()
-    neighbours.overlap = overlap
+    neighbours.overlap = options.overlap if kind == "sequential" else options.near
+    neighbours.quadratic_overlap = kind == "sequential"
     neighbours.loop_detection = False  # it would need a vocabulary tree, which COLMAP downloads
     return neighbours
 
 
-def _map(database: Path, folder: Path, sparse: Path, count: int, options: SfmOptions) -> Any:
+def _retry(best: Any, database: Path, folder: Path, sizes: Sizes, options: SfmOptions, work: Path) -> Any:
+    """Match remaining photos with all others, most similar first, and continue mapping until no more are placed."""
+    if chosen_matcher(len(sizes), options) == "exhaustive":
+        return best
+    for attempt in count_from(1):
+        lost = unplaced(best, sizes)
+        partners = min(options.retry_pairs // max(1, len(lost)), len(sizes) - 1)
+        if not lost or not partners:
+            break
+        logger.info(
+            "sfm: %d of %d photos are not placed: matching each with %d others", len(lost), len(sizes), partners
+        )
+        if not match_similar(database, partners, partners * len(lost), options, lost):
+            break
+        again = largest(_map(database, folder, work / f"sparse{attempt}", len(sizes), options, best))
+        if again is None or len(unplaced(again, sizes)) >= len(lost):
+            break
+        best = again
+    return best
+
+
+def unplaced(model: Any, sizes: Sizes) -> list[str]:
+    """Return sorted names of the photos that a pycolmap.Reconstruction, or None, does not place."""
+    placed = {model.image(number).name for number in model.reg_image_ids()} if model is not None else set()
+    return sorted(sizes.keys() - placed)
+
+
+def _map(database: Path, folder: Path, sparse: Path, count: int, options: SfmOptions, start: Any = None) -> Any:
+    """Return pycolmap's models by number; mapping continues from `start`, a pycolmap.Reconstruction, if any."""
     import pycolmap
 
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.num_threads = pipeline.mapper.num_threads = options.mapping_threads or -1
     pipeline.random_seed = pipeline.mapper.random_seed = pipeline.triangulation.random_seed = options.seed
-    placed: list[None] = []
+    placed: list[None] = [None] * (start.num_reg_images() if start is not None else 0)
     sparse.mkdir()
+    begin = sparse / "start"
+    if start is not None:
+        begin.mkdir()
+        start.write_binary(begin)
 
     def reconstruct(cancellation_token: Any) -> dict[int, Any]:
         pycolmap.set_random_seed(options.seed)  # of this thread
@@ -181,6 +280,7 @@ def _map(database: Path, folder: Path, sparse: Path, count: int, options: SfmOpt
             folder,
             sparse,
             pipeline,
+            input_path=begin if start is not None else "",
             initial_image_pair_callback=lambda: placed.extend([None, None]),
             next_image_callback=lambda: placed.append(None),
             cancellation_token=cancellation_token,

@@ -28,6 +28,9 @@ NOT_COMPARED = "eval.competitor"
 UNCHANGED = {
     "scene.model": "auto",
     "scene.distances": "even",
+    "scene.similar": 10,
+    "scene.near": 2,
+    "scene.retry_pairs": 2000,
     "backbone.density.passes": 1.0,
     "backbone.clone_split.density.passes": 1.0,
 }
