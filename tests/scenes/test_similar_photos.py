@@ -12,11 +12,17 @@ import pytest
 from synthetic_colmap import shipped
 
 from gsx.experiments.runs.typed import typed
-from gsx.scenes import sfm
+from gsx.scenes import sfm, vocabulary
 from gsx.scenes.photos import PhotosOptions
 from gsx.scenes.vocabulary import learn_vocabulary, sample_descriptors
 
 PLACES, VISITS, FEATURES = 5, 4, 150
+
+
+@pytest.fixture(autouse=True)
+def few_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Learn 64 words, which takes a fraction of a second."""
+    monkeypatch.setattr(vocabulary, "WORDS", 64)
 
 
 def options(**changes: Any) -> PhotosOptions:
