@@ -5,6 +5,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pycolmap
 import torch
 
@@ -68,3 +69,50 @@ def colmap_options(folder: Path, **changes: Any) -> ColmapOptions:
     made = typed(ColmapOptions, shipped("colmap") | {"path": str(folder)} | changes, "scene")
     assert isinstance(made, ColmapOptions)
     return made
+
+
+def captured(
+    truth: Sequence[float],
+    stated: Sequence[float] | float,
+    *,
+    noise: float = 0.5,
+    points: int = 45,
+    sides: Sequence[tuple[int, int]] = ((640, 480),),
+) -> Any:
+    """A model of photos with true focal lengths `truth`, px: keypoints off by `noise` px, cameras as `stated`.
+
+    One number: all share a camera. Photos take the sizes `sides` in turn; their principal point is the middle.
+    """
+    generator = np.random.default_rng(0)
+    out, world = pycolmap.Reconstruction(), generator.uniform(-1, 1, (points, 3))
+    pixels = np.empty((len(truth), points, 2))
+    for at, focal in enumerate(truth):
+        width, height = sides[at % len(sides)]
+        own = stated if isinstance(stated, float) else stated[at]
+        number = 1 if isinstance(stated, float) else at + 1
+        if not out.exists_camera(number):
+            params = [own, own, width / 2, height / 2]
+            camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params, camera_id=number)
+            out.add_camera_with_trivial_rig(camera)
+        pose = looking_in(generator)
+        x, y, z = (pose * world).T
+        exact = np.stack([focal * x / z + width / 2, focal * y / z + height / 2], 1)
+        pixels[at] = exact + generator.normal(size=exact.shape) * noise
+        image = pycolmap.Image(name=f"{at:03}.png", keypoints=pixels[at], camera_id=number, image_id=at + 1)
+        out.add_image_with_trivial_frame(image, pose)
+    for index, position in enumerate(world):
+        track = pycolmap.Track()
+        for at in range(len(truth)):
+            track.add_element(at + 1, index)
+        out.add_point3D(position, track)
+    return out
+
+
+def looking_in(generator: np.random.Generator) -> Any:
+    """A camera at 3 to 6 from the middle of the world, which looks there."""
+    towards = generator.normal(size=3)
+    forward = -towards / np.linalg.norm(towards)
+    right = np.cross(forward, generator.normal(size=3))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.array([0, 0, generator.uniform(3, 6)]))

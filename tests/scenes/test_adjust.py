@@ -15,10 +15,10 @@ from synthetic_colmap import PINHOLE, colmap_options, synthesize, write_scene
 
 from gsx.core.data.scene import Scene
 from gsx.core.errors import ConfigError
-from gsx.scenes import adjust
-from gsx.scenes.adjust import movements, shift_of
+from gsx.scenes import adjust, bundle, keypoint_fit
 from gsx.scenes.colmap import FORMAT, load
 from gsx.scenes.colmap_model import Model, read_model
+from gsx.scenes.keypoint_fit import movements, shift_of
 
 
 def turned(reconstruction: Any, px: float) -> Any:
@@ -103,7 +103,7 @@ def test_movements_are_derivatives_of_directions() -> None:
 
 
 def test_models_of_few_observations_tell_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(adjust, "LEAST", 51)
+    monkeypatch.setattr(keypoint_fit, "LEAST", 51)
     write_scene(zoomed(synthesize(), 1.01), tmp_path)
     assert shift_of(read_model(tmp_path / "sparse/0")) is None
     notes = load(colmap_options(tmp_path, adjust="auto")).notes
@@ -147,10 +147,10 @@ def test_the_distortion_of_other_cameras_is_none_of_these(tmp_path: Path) -> Non
     """A lens that is found to be bent; of a camera that has no photographs nothing is told."""
     bent = synthesize("OPENCV", (*(10 * x for x in PINHOLE), 0.2, 0.0, 0.0, 0.0), frames=8, size=(640, 480))
     write_scene(straightened(bent), tmp_path / "bent")
-    found = adjust.bundle_adjusted(tmp_path / "bent" / "sparse" / "0")
+    found = bundle.bundle_adjusted(tmp_path / "bent" / "sparse" / "0")
     [number] = found.cameras
-    assert adjust.bend_of(found, [number]) > 0.25
-    assert adjust.bend_of(found, [number + 1]) == 0
+    assert bundle.bend_of(found, [number]) > 0.25
+    assert bundle.bend_of(found, [number + 1]) == 0
 
 
 def test_no_distortion_is_made_up(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from gsx.core.errors import InputError
 from gsx.core.files import expand_home, is_file
 from gsx.core.ranges import Range
 from gsx.core.shapes import Float
-from gsx.scenes.adjust import WHEN, adjust_model, fit_line
+from gsx.scenes.adjust import WHEN, adjust_model, camera_lines, fit_line
 from gsx.scenes.colmap_folders import (
     AUTO,
     find_model,
@@ -69,7 +69,7 @@ def load(options: ColmapOptions) -> Scene:
     stated = read_model(folder)
     if images == IMAGES and not (folder in model_folders(path) and (path / IMAGES).is_dir()):
         images = image_folder(path, stated)
-    model, adjustment = adjust_model(stated, options.adjust)
+    model, adjustment = adjust_model(stated, options.adjust, path / images)
     notes += [f"Photos are those in {images}."] if images != options.images else []
     return build(model, path / images, replace(options, images=images), [*notes, *adjustment])
 
@@ -206,6 +206,7 @@ def facts(path: Path) -> Iterator[str]:
     for (name, width, height), count in sorted(kinds.items()):
         yield f"camera    {name} {width}x{height}, {count} images"
     images = image_folder(path, model)
+    yield from (f"cameras   {line}" for line in camera_lines(model, path / images))
     present = [image for image in model.images if is_file(path / images / image.name)]
     absent = _absent(model, present)
     missing = f", absent: {some_names(absent)}" if absent else ""
