@@ -80,7 +80,7 @@ def test_one_lens_with_one_camera_is_not_split(tmp_path: Path) -> None:
 
 def test_models_of_few_observations_are_to_be_made_anew(tmp_path: Path) -> None:
     scene = loaded(captured([FOCAL] * PHOTOS, list(SPREAD), points=20), tmp_path)
-    assert "cannot tell, too few observations: reconstruct the photos with scene=photos" in cameras_note(scene)
+    assert "undecided, too few observations: reconstruct the photos with scene=photos" in cameras_note(scene)
     assert focal_lengths(scene) == pytest.approx(SPREAD)
 
 

@@ -36,11 +36,11 @@ class Proposal:
     labels: Mapping[str, Hashable]
     """Label of the proposed camera by name of image; equal labels share a camera."""
     words: str
-    """What is unusual about the cameras, with numbers."""
+    """Description of the cameras, with numbers."""
     unusual: bool
-    """Whether focal lengths differ by more than their uncertainty explains."""
+    """True if focal lengths differ by more than their uncertainty explains."""
     thin: bool
-    """Whether most photos have too few observations to compare cameras."""
+    """True if most photos have too few observations to compare cameras."""
 
 
 def proposal(model: Model, lenses: Lenses) -> Proposal | None:

@@ -41,11 +41,11 @@ class Candidate:
     labels: Mapping[int, Hashable]
     """Label of the camera by image; equal labels share a camera."""
     scaled: bool = False
-    """Whether sizes differ by a scale, so that focal lengths relate to the longer side; else photos were trimmed."""
+    """True if sizes differ by a scale, so that focal lengths relate to the longer side; else photos were trimmed."""
     bent: bool = False
-    """Whether cameras without distortion get some."""
+    """True if cameras without distortion get some."""
     own_radial: bool = False
-    """Whether photos share the focal length alone, and each has a radial distortion of its own."""
+    """True if photos share the focal length alone, and each has a radial distortion of its own."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -67,7 +67,7 @@ def lenses_of(model: Model, photos: Path) -> Lenses:
 def decide(model: Model, proposed: Proposal) -> Decision:
     """Compare the proposed cameras with a model's own, or read that from the cache; InputError: an adjustment fails."""
     if proposed.thin:
-        return Decision(words=f"{proposed.words}: cannot tell, too few observations: {ANEW}")
+        return Decision(words=f"{proposed.words}: undecided, too few observations: {ANEW}")
     compared = kept_comparison(model, proposed)
     if compared is None:
         compared = comparison(model, proposed)
@@ -78,10 +78,10 @@ def decide(model: Model, proposed: Proposal) -> Decision:
 def decision(proposed: Proposal, compared: Mapping[str, Any]) -> Decision:
     """Return the verdict on a comparison: the candidate with the largest gain, if that is sure."""
     if compared["refusal"]:
-        return Decision(words=f"{proposed.words}: cannot tell, {compared['refusal']}")
+        return Decision(words=f"{proposed.words}: undecided, {compared['refusal']}")
     baseline, *others = [Result(**fields) for fields in compared["results"]]
     best = max(others, key=lambda one: one.gain)
-    verdict = VERDICTS[proposed.kind] if best.better() else "right as they are" if best.worse() else "cannot tell"
+    verdict = VERDICTS[proposed.kind] if best.better() else "right as they are" if best.worse() else "undecided"
     figures = [f"{baseline.name} {baseline.median:.3f} px", *map(figure, others)]
     return Decision(
         words=f"{proposed.words}: held-out keypoints ({compared['held']}) are off by {', '.join(figures)}; {verdict} "
