@@ -13,10 +13,11 @@ from synthetic_colmap import colmap_options, synthesize, write_scene
 from torch import Tensor
 
 from gsx.core.data.images import write_image
-from gsx.scenes import adjust
-from gsx.scenes.adjust import fit_line, shift_of
+from gsx.scenes import bundle
+from gsx.scenes.adjust import fit_line
 from gsx.scenes.colmap import FORMAT, load
 from gsx.scenes.colmap_model import read_model
+from gsx.scenes.keypoint_fit import shift_of
 from gsx.scenes.lens_folds import LEAST_SHARE, largest_rectangle
 from gsx.scenes.posed import lens_notes, shot_through
 from gsx.scenes.transforms import lens_of
@@ -155,8 +156,8 @@ def test_rays_behind_a_fisheye_are_no_rays() -> None:
 
 def test_bends_are_measured_where_there_are_rays(tmp_path: Path) -> None:
     reconstruction, _ = observed_at(wide(), CORNER)
-    assert math.isfinite(adjust.bend_of(reconstruction, list(reconstruction.cameras)))
-    assert adjust.bend_of(reconstruction, list(reconstruction.cameras)) > 0.1
+    assert math.isfinite(bundle.bend_of(reconstruction, list(reconstruction.cameras)))
+    assert bundle.bend_of(reconstruction, list(reconstruction.cameras)) > 0.1
 
 
 # lenses that fold inside of the picture
