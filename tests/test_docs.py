@@ -98,7 +98,8 @@ def test_commands_of_pages_are_accepted(page: Path) -> None:
     from gsx.cli.dispatch import VERBS
 
     blocks = re.findall(r"```sh\n(.*?)```", page.read_text(), re.S)
-    commands = [line.split("#")[0].strip() for block in blocks for line in block.splitlines() if line.startswith("gsx")]
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    commands = [line.split("#")[0].strip() for line in lines if line.startswith("gsx")]
     for command in commands:
         words = shlex.split(command)[1:]
         if words and words[0] in (*VERBS, "FOLDER", "VIDEO"):  # placeholders of paths

@@ -22,7 +22,17 @@ from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "write-a-plugin.md"
 FEW = ("scene.points=100",)
+
+
+def write_files_of_page(folder: Path) -> None:
+    """Write the files of the page's complete plugin: those named in bold, with the code below them or empty."""
+    for name, code in re.findall(
+        r"^\*\*`(my_plugin/[^`]+)`\*\*[^\n]*(?:\n\n```\w+\n(.*?)^```)?", PAGE.read_text(), re.M | re.S
+    ):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(code)
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +42,7 @@ def site(tmp_path_factory) -> Path:
     source = tmp_path_factory.mktemp("source")
     for name in ("plugin", "pseudo_plugin", "own_plugin", "module_plugin"):
         shutil.copytree(EXAMPLES / name, source / name)
+    write_files_of_page(source)
     command = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--no-build-isolation"]
     command += ["--target", str(folder), *map(str, source.iterdir())]
     subprocess.run(command, check=True, capture_output=True)
@@ -92,6 +103,13 @@ def test_its_augmenter_trains_with_its_regenerator(tmp_path: Path, capsys: pytes
     asked = [line["pseudo"]["steady_zoom"]["asked"]["2"] for line in lines if "pseudo" in line]
     assert sum(asked) == 6, "each training view once: told without a word of the augmenter's"
     assert evaluation["pseudo"]["steady_zoom"]["asked"] == {"2": 6}
+
+
+@pytest.mark.usefixtures("installed")
+def test_the_plugin_of_the_page_trains_as_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    chosen = ("augmenter=upscale", "regenerator/upscale=doubled", "scene.width=48", "scene.height=36", "iterations=8")
+    assert main(words(tmp_path / "run", *chosen, *FEW)) == 0
+    assert re.search(r"upscale at step \d+: (\d+) of \1 pictures", capsys.readouterr().err)
 
 
 @pytest.fixture(scope="module")
