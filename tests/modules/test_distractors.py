@@ -18,13 +18,10 @@ from gsx.core.errors import Stopped
 from gsx.experiments.runs.degraded import patch_of
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run
-from gsx.modules.derived_views import reduce_view
+from gsx.modules.derived_views import MaskedSource, mask_view, mask_views, reduce_view
 from gsx.modules.distractors import (
     DistractorOptions,
     Distractors,
-    MaskedSource,
-    mask_view,
-    mask_views,
     measure_differences,
     remove_rows,
     rows_of_distractors,

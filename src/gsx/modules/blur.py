@@ -56,6 +56,7 @@ class Blur(Correction):
     options: BlurOptions
     seconds_key = "blur_seconds"
     figures_key = "blur"
+    count_key = "blurred"
 
     def __init__(self, options: BlurOptions, context: ModuleContext) -> None:
         super().__init__(options, context)

@@ -11,12 +11,14 @@ from gsx.modules.exposure import Exposure, ExposureOptions
 from gsx.modules.plateau import Plateau, PlateauOptions
 from gsx.modules.poses import PoseOptions, Poses
 from gsx.modules.supersampling import Supersampling, SupersamplingOptions
+from gsx.modules.trial import Trial, TrialOptions
 
 MODULES: Mapping[str, tuple[type[TrainingModule], type]] = {
     "coarse_to_fine": (CoarseToFine, CoarseToFineOptions),
     "supersampling": (Supersampling, SupersamplingOptions),
     "plateau": (Plateau, PlateauOptions),
     "deadline": (Deadline, DeadlineOptions),
+    "trial": (Trial, TrialOptions),
     "poses": (Poses, PoseOptions),
     "exposure": (Exposure, ExposureOptions),
     "blur": (Blur, BlurOptions),

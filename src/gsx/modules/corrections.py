@@ -64,6 +64,8 @@ class Correction(TrainingModule):
     """Key of the time of an estimate in metrics.jsonl."""
     figures_key: ClassVar[str]
     """Key of its figures in evaluation.json."""
+    count_key: ClassVar[str]
+    """Key in metrics.jsonl that is 0 where no photo is corrected."""
     last_estimate = 0
     """Step of the last estimate: repeating that step does not estimate again."""
 

@@ -1,14 +1,16 @@
-"""Training views derived from others: at a fraction of their size, or with another pose."""
+"""Training views derived from others: at a fraction of their size, with another pose, or masked."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.masks import grown
 from gsx.core.data.reduction import Reduction
-from gsx.core.data.scene import DerivedSource, ImageSource, View
-from gsx.core.shapes import Bool, UInt8
+from gsx.core.data.scene import CutOut, DerivedSource, ImageSource, View
+from gsx.core.shapes import Bool, Int, UInt8
 
 MIN_SIDE = 32
 """Fewest pixels of an image's shorter side: smaller ones show little, and SSIM needs windows of 11."""
@@ -93,3 +95,49 @@ def fixed_source(view: View) -> ImageSource:
 def change_pose(view: View, camera: Camera) -> View:
     """Returns the view with the pose of a camera and its present photo."""
     return replace(view, camera=view.camera.with_pose_of(camera), source=fixed_source(view))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MaskedSource(DerivedSource):
+    """A photo with masked blocks."""
+
+    masked: Bool[Tensor, "h w"]
+    """Masked blocks of whole pixels of the photo; the last row and column include the remaining pixels."""
+    size: tuple[int, int]
+    """(width, height) of the photo, px."""
+
+    def counted(self, camera: Camera) -> Bool[Tensor, "H W"]:
+        """Returns the pixels that count in the other source and are not masked."""
+        (height, width), frame = self.masked.shape, camera.frame
+        down = block_of(frame.top, camera.height, frame.height, self.size[1], height)
+        across = block_of(frame.left, camera.width, frame.width, self.size[0], width)
+        clear, counted = ~self.masked[down[:, None], across], super().counted(camera)
+        return clear if counted is None else clear & counted
+
+    def transparent(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
+        """Returns the pixels of the other source that show only the background."""
+        return self.source.transparent(camera) if isinstance(self.source, CutOut) else None
+
+
+def block_of(first: int, count: int, frame: int, size: int, blocks: int) -> Int[Tensor, "P"]:
+    """Returns the block of each of `count` pixels from `first` on along an axis.
+
+    frame: pixels of the whole photo at their scale. size: px of the photo. blocks: of the photo.
+    """
+    places = (torch.arange(count) + 0.5 + first) / frame * size
+    return (places / max(1, size // blocks)).long().clamp(0, blocks - 1)
+
+
+def mask_views(views: Sequence[View], masks: Sequence[Bool[Tensor, "h w"]]) -> list[View]:
+    """Returns views with masked photos."""
+    return [mask_view(view, mask) for view, mask in zip(views, masks, strict=True)]
+
+
+def mask_view(view: View, mask: Bool[Tensor, "h w"]) -> View:
+    """Returns the view with a masked photo; a coarse pixel counts if no part of it is masked."""
+    if not bool(mask.any()):
+        return view
+    if isinstance(view.source, CoarseSource):
+        return replace(view, source=view.source.of(mask_view(view.source.view, mask)))
+    frame = view.camera.frame
+    return replace(view, source=MaskedSource(source=view.source, masked=mask, size=(frame.width, frame.height)))

@@ -7,16 +7,15 @@ the user's; pseudo views made before stay. Test photos are not used.
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera
-from gsx.core.data.scene import CutOut, DerivedSource, View
+from gsx.core.data.scene import View
 from gsx.core.ranges import Range, Share
-from gsx.core.shapes import Bool, Int
+from gsx.core.shapes import Bool
 from gsx.core.training.importance import Probe
 from gsx.core.training.module import ModuleContext
 from gsx.core.training.parameter_table import keep_rows
@@ -31,7 +30,7 @@ from gsx.modules.corrections import (
     percent,
     sample,
 )
-from gsx.modules.derived_views import CoarseSource, reduce_view
+from gsx.modules.derived_views import mask_views, reduce_view
 from gsx.modules.distractor_masks import Difference, difference_of, distractors_in
 from gsx.modules.photo_pairs import REDUCTION, gains, match_brightness, render_reduced
 
@@ -61,6 +60,7 @@ class Distractors(Correction):
     options: DistractorOptions
     seconds_key = "distractor_seconds"
     figures_key = "distractors"
+    count_key = "distractors"
     in_views = True
 
     def __init__(self, options: DistractorOptions, context: ModuleContext) -> None:
@@ -180,52 +180,3 @@ def remove_rows(run: Run, rows: Bool[Tensor, "N"]) -> int:
 def mean_share(masks: Sequence[Bool[Tensor, "h w"]]) -> float:
     """Returns the masked share of the pixels, in the mean over photos."""
     return sum(float(mask.float().mean()) for mask in masks) / max(1, len(masks))
-
-
-# -- views without distractors -----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class MaskedSource(DerivedSource):
-    """A photo with masked blocks."""
-
-    masked: Bool[Tensor, "h w"]
-    """Masked blocks of whole pixels of the photo; the last row and column include the remaining pixels."""
-    size: tuple[int, int]
-    """(width, height) of the photo, px."""
-
-    def counted(self, camera: Camera) -> Bool[Tensor, "H W"]:
-        """Returns the pixels that count in the other source and are not masked."""
-        (height, width), frame = self.masked.shape, camera.frame
-        down = block_of(frame.top, camera.height, frame.height, self.size[1], height)
-        across = block_of(frame.left, camera.width, frame.width, self.size[0], width)
-        clear, counted = ~self.masked[down[:, None], across], super().counted(camera)
-        return clear if counted is None else clear & counted
-
-    def transparent(self, camera: Camera) -> Bool[Tensor, "H W"] | None:
-        """Returns the pixels of the other source that show only the background."""
-        return self.source.transparent(camera) if isinstance(self.source, CutOut) else None
-
-
-def block_of(first: int, count: int, frame: int, size: int, blocks: int) -> Int[Tensor, "P"]:
-    """Returns the block of each of `count` pixels from `first` on along an axis.
-
-    frame: pixels of the whole photo at their scale. size: px of the photo. blocks: of the photo.
-    """
-    places = (torch.arange(count) + 0.5 + first) / frame * size
-    return (places / max(1, size // blocks)).long().clamp(0, blocks - 1)
-
-
-def mask_views(views: Sequence[View], masks: Sequence[Bool[Tensor, "h w"]]) -> list[View]:
-    """Returns views with masked photos."""
-    return [mask_view(view, mask) for view, mask in zip(views, masks, strict=True)]
-
-
-def mask_view(view: View, mask: Bool[Tensor, "h w"]) -> View:
-    """Returns the view with a masked photo; a coarse pixel counts if no part of it is masked."""
-    if not bool(mask.any()):
-        return view
-    if isinstance(view.source, CoarseSource):
-        return replace(view, source=view.source.of(mask_view(view.source.view, mask)))
-    frame = view.camera.frame
-    return replace(view, source=MaskedSource(source=view.source, masked=mask, size=(frame.width, frame.height)))

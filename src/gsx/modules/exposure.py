@@ -118,6 +118,7 @@ class Exposure(Correction):
     options: ExposureOptions
     seconds_key = "exposure_seconds"
     figures_key = "exposures"
+    count_key = "exposures"
 
     def __init__(self, options: ExposureOptions, context: ModuleContext) -> None:
         super().__init__(options, context)

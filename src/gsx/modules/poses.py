@@ -61,6 +61,7 @@ class Poses(Correction):
     options: PoseOptions
     seconds_key = "pose_seconds"
     figures_key = "poses"
+    count_key = "poses"
     in_views = True
 
     def __init__(self, options: PoseOptions, context: ModuleContext) -> None:
