@@ -135,7 +135,7 @@ def test_a_stretch_ends_before_another_correction_is_tested() -> None:
 
 @pytest.mark.parametrize("gain", [1.0, -1.0])
 def test_the_better_stretch_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float) -> None:
-    monkeypatch.setattr("gsx.modules.trial.gain_of", lambda tried, other: (gain, 0.5))
+    monkeypatch.setattr("gsx.modules.trial.gain_of", lambda tried, other: (gain, 0.4))
     run = tiny_run(tmp_path, WORDS)
     assert run.complete
     assert run.modules["exposure"].active == (gain > 0)

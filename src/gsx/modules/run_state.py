@@ -12,7 +12,7 @@ from gsx.core.training.run import Run
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunState:
-    """What a run needs to go on from a step: the content of a checkpoint, in memory."""
+    """Content of a checkpoint, in memory."""
 
     step: int
     table: Mapping[str, Tensor]

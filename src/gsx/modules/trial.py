@@ -35,10 +35,12 @@ logger = logging.getLogger(__name__)
 
 GAIN, ERROR = "_trial", "_error"
 """Ends of the keys of a gain and its standard error in metrics.jsonl."""
+SURE = 2
+"""Standard errors by which a gain must exceed 0."""
 MOST_MASKED = 1 / 3
 """Largest share of the training views with a masked window."""
 MIN_STEPS = 10
-"""Fewest steps of a stretch that tell anything: in shorter runs tests alone decide."""
+"""Fewest steps of a stretch: in shorter runs tests alone decide."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,7 +161,7 @@ class Trial(TrainingModule):
             gain, error = gain_of(tried, best)
             log_trial(module.name, start.step + 1, length, gain, error)
             metrics |= {module.name + GAIN: gain, module.name + GAIN + ERROR: error}
-            if gain > error:
+            if helps(gain, error):
                 best, base = tried, corrected
             else:
                 metrics[module.count_key] = 0
@@ -219,7 +221,7 @@ class Trial(TrainingModule):
     def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
         """Reports which corrections stayed."""
         for name, trial in (evaluation.get("trials") or {}).items():
-            outcome = "stay" if trial["gain"] > trial["error"] else "were taken back"
+            outcome = "stay" if helps(trial["gain"], trial["error"]) else "were taken back"
             yield (
                 f"corrections ({name}) {outcome} after a trial: {trial['gain']:+.2f} +- {trial['error']:.2f} dB on "
                 "windows that were not learnt"
@@ -268,8 +270,13 @@ def error_at_best_gains(pair: WindowPair, mask: Bool[Tensor, "h w"]) -> Float[Te
 
 def log_trial(name: str, step: int, length: int, gain: float, error: float) -> None:
     """Logs the outcome of a trial."""
-    sign, outcome = (">", "it stays") if gain > error else ("<=", "taken back")
+    sign, outcome = (">", "it stays") if helps(gain, error) else ("<=", "taken back")
     logger.info(
-        "step %d: %s tried for %d steps, gain on masked windows %+.2f dB %s its standard error %.2f dB: %s",
-        *(step, name, length, gain, sign, error, outcome),
+        "step %d: %s tried for %d steps, gain on masked windows %+.2f dB %s %d standard errors of %.2f dB: %s",
+        *(step, name, length, gain, sign, SURE, error, outcome),
     )
+
+
+def helps(gain: float, error: float) -> bool:
+    """Returns whether a gain is no chance."""
+    return gain > SURE * error
