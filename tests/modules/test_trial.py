@@ -67,7 +67,7 @@ def test_a_run_that_goes_back_repeats_its_bits(tmp_path: Path, backbone: str) ->
 
 def test_windows_are_masked_during_a_trial_only() -> None:
     scene = small_scene(spread(5), views=3)
-    trial = build_module(Trial, TrialOptions(), scene=scene)
+    trial = build_module(Trial, TrialOptions(steps=0.04), scene=scene)
     assert trial.transform_views(scene.train, 1) is scene.train
     trial.set_windows({1: Window(2, 3, 4, 5)})
     views = trial.transform_views(scene.train, 1)

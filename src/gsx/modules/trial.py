@@ -47,8 +47,8 @@ MIN_STEPS = 10
 class TrialOptions:
     """Options; values in conf/module/trial.yaml."""
 
-    steps: Share = 0.04
-    """Share of the steps in a stretch; 0: corrections stay by their tests alone."""
+    steps: Share = 0.0
+    """Share of the steps in a stretch; 0, as in runs older than this option: corrections stay by their tests alone."""
     views: Annotated[int, Range(2, 1000)] = 24
     """Most training views with a masked window."""
     window: Annotated[float, Range(0.05, 1)] = 0.5

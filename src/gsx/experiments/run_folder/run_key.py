@@ -39,6 +39,8 @@ WITHOUT_EFFECT = {
     "training.deadline": {"seconds": 0.0, "steps": 0, "planned": [], "start": 0.5, "to": 0.8, "skip": []},
 }
 """Nodes newer than the first digests, with values by which they change nothing and do not count."""
+TRIAL = "training.trial"
+"""Node newer than the first digests, which changes nothing where no correction is tested."""
 
 
 def trained(config: dict[str, Any], idle: Collection[str]) -> dict[str, Any]:
@@ -57,7 +59,9 @@ def unchanged(config: dict[str, Any]) -> list[str]:
         for key, neutral in WITHOUT_EFFECT.items()
         if all(values.get(f"{key}.{name}", ...) == value for name, value in neutral.items())
     ]
-    return [*nodes, *(key for key, value in values.items() if UNCHANGED.get(key, ...) == value)]
+    tested = any(key.endswith(".when") and value == "auto" for key, value in values.items())
+    trial = [] if tested else [TRIAL]
+    return [*nodes, *trial, *(key for key, value in values.items() if UNCHANGED.get(key, ...) == value)]
 
 
 def axes_of(config: dict[str, Any]) -> dict[str, Any]:
