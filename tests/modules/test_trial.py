@@ -24,7 +24,7 @@ WORDS = (
     "iterations=60",
     "training.exposure.when=auto",
     "scene.disturb.exposure=0.3",
-    "training.trial.steps=0.2",
+    *("training.trial.steps=0.2", "training.trial.passes=9"),
     "training.trial.window=0.3",
     "backbone.density.stop=6000",
     "scene.points=100",
@@ -122,12 +122,13 @@ def stretch_of(pairs: list[WindowPair], finite: bool = True) -> Stretch:
 
 
 def test_a_stretch_ends_before_another_correction_is_tested() -> None:
-    trial = build_module(Trial, TrialOptions(steps=0.1))
+    trial = build_module(Trial, TrialOptions(steps=0.1, passes=100))
     poses = build_module(Poses, PoseOptions(when="auto", start=0.25))
     run = type("Run", (), {"modules": {"trial": trial, "poses": poses}})()
     assert trial.length(run, 201) == 50
     assert trial.length(run, 251) == 100
     assert trial.length(run, 951) == 50
+    assert build_module(Trial, TrialOptions(steps=0.1, passes=5), views=4).length(run, 301) == 20
 
 
 # -- runs --------------------------------------------------------------------------------------------------------------

@@ -48,7 +48,9 @@ class TrialOptions:
     """Options; values in conf/module/trial.yaml."""
 
     steps: Share = 0.0
-    """Share of the steps in a stretch; 0, as in runs older than this option: corrections stay by their tests alone."""
+    """Largest share of the steps in a stretch; 0, as in runs older than this option: tests alone decide."""
+    passes: Annotated[float, Range(0.01, 100)] = 1.0
+    """Passes over the training views in a stretch."""
     views: Annotated[int, Range(2, 1000)] = 24
     """Most training views with a masked window."""
     window: Annotated[float, Range(0.05, 1)] = 0.5
@@ -142,7 +144,8 @@ class Trial(TrainingModule):
         modules = [module for module in run.modules.values() if isinstance(module, Correction)]
         firsts = [first for module in modules if (first := min(module.milestones(), default=step)) > step]
         steps = round(self.options.steps * self.context.iterations)
-        return min([steps, self.context.iterations - step + 1, *(first - step for first in firsts)])
+        views = round(self.options.passes * len(self.context.scene.train) / self.context.batch)
+        return min([steps, views, self.context.iterations - step + 1, *(first - step for first in firsts)])
 
     def decide(self, run: Run, tested: Sequence[Correction], start: RunState, length: int) -> dict[str, float]:
         """Tests corrections, tries those that their tests call for, and leaves the run after the best stretch."""
