@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,6 +17,7 @@ from gsx.core.training.run import Run
 from gsx.core.training.trainer import train_step
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.load_scene import load_scene
+from gsx.modules.exposure import Exposure, ExposureOptions
 from gsx.modules.poses import PoseOptions, Poses
 from gsx.modules.run_state import RunState, return_to, state_of
 from gsx.modules.trial import Stretch, Trial, TrialOptions, WindowPair, error_at_best_gains, gain_of
@@ -124,7 +126,7 @@ def stretch_of(pairs: list[WindowPair], finite: bool = True) -> Stretch:
 def test_a_stretch_ends_before_another_correction_is_tested() -> None:
     trial = build_module(Trial, TrialOptions(steps=0.1, passes=100))
     poses = build_module(Poses, PoseOptions(when="auto", start=0.25))
-    run = type("Run", (), {"modules": {"trial": trial, "poses": poses}})()
+    run = SimpleNamespace(modules={"trial": trial, "poses": poses})
     assert trial.length(run, 201) == 50
     assert trial.length(run, 251) == 100
     assert trial.length(run, 951) == 50
@@ -163,3 +165,11 @@ def test_where_tests_call_for_nothing_a_run_has_the_bits_of_one_without(tmp_path
     tiny_run(tmp_path / "never", ("training.exposure.when=never", *WORDS[2:], WORDS[0]))
     auto, never = final_tensors(tmp_path / "auto"), final_tensors(tmp_path / "never")
     assert all(torch.equal(auto[name], never[name]) for name in never)
+
+
+def test_runs_with_augmenters_have_no_trials() -> None:
+    trial = build_module(Trial, TrialOptions(steps=0.1))
+    exposure = build_module(Exposure, ExposureOptions(when="auto"))
+    run = SimpleNamespace(modules={"trial": trial, "exposure": exposure}, step=200, augmenters={"upscale": object()})
+    assert trial.tested(run, 201) == [exposure]
+    assert trial.before_step(run) == {}

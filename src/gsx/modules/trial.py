@@ -118,9 +118,9 @@ class Trial(TrainingModule):
     # -- trials --------------------------------------------------------------------------------------------------------
 
     def before_step(self, run: Run) -> dict[str, float]:
-        """Tries the corrections that are tested before the next step."""
+        """Tries the corrections that are tested before the next step; augmenters would make their views twice."""
         step = run.step + 1
-        tested = [] if self.windows else self.tested(run, step)
+        tested = [] if self.windows or run.augmenters else self.tested(run, step)
         length = self.length(run, step) if tested else 0
         if length < MIN_STEPS:
             return {}
