@@ -78,7 +78,7 @@ def test_what_is_asked_of_one_composition_is_composed_once_and_nobody_changes_it
     words, asked = ["backbone=mip_splatting", "iterations=100"], list[tuple[str, ...]]()
     own = compose(words, plugins()).resolved
     place = "gsx.experiments.runs.compose.compose_raw"
-    monkeypatch.setattr(place, lambda words: asked.append(words) or compose_raw(words))
+    monkeypatch.setattr(place, lambda words, registry: asked.append(words) or compose_raw(words))
     with Compositions(plugins()) as compositions:
         first = compositions.settings(words)
         compositions.node(words, "training")["batch"] = 7
@@ -207,8 +207,8 @@ def test_common_scene_defaults_agree_with_the_schema() -> None:
         (["backbone.rates.sh_constant=1"], "It is now called 'backbone.rates.sh_dc'"),
         (["init=trunk"], "choose scratch, warm_start, or a splat file"),
         (["+backbone.rates.mean_first=1"], "'backbone.rates.mean_first'.*Did you mean 'backbone.rates.means_first'"),
-        (["iterations=many"], "iterations: Value 'many'"),
-        (["backbone.sh_degree=abc"], "backbone.sh_degree: Value 'abc'"),
+        (["iterations=many"], "iterations is 'many'; give a whole"),
+        (["backbone.sh_degree=abc"], "backbone.sh_degree is 'abc'; give a whole number from 0 to 3"),
         (["backbone.density.gradient=[1]"], "backbone.density.gradient"),
         (["backbone.name=mine"], "backbone.name is 'mine'"),
         (["rasterizer.cull=loose"], "rasterizer.cull is 'loose'"),
@@ -235,6 +235,13 @@ def test_common_scene_defaults_agree_with_the_schema() -> None:
         (["training.supersampling.start=1"], "training.supersampling.start is 1.0; set a share of the steps"),
         (["backbone=scaffold", "preset=zoom"], "Unknown key 'backbone.rates.shortened'"),
         (["rasterizer.dilation=0"], "rasterizer.dilation is 0"),
+        (["minutes=ten"], "^minutes is 'ten'; give a number from 0 to 1,000,000, such as minutes=10$"),
+        (["iterations=1k"], "^iterations is '1k'; give a whole number from 0 to 1,000,000,000, such as iterations=10$"),
+        (["output=[a]"], r"^output is \['a'\]; give text$"),
+        (["seed=null"], "^seed is null; give a whole number"),
+        (["reuse=maybe"], "^reuse is 'maybe'; give true or false$"),
+        (["eval.zoom=0"], r"^eval.zoom is 0; give a list of numbers from 0.015625 to 64, such as 'eval.zoom=\[1,2\]'$"),
+        (["eval.zoom=[1,b]"], r"^eval.zoom is \[1, 'b'\]; give a list of numbers"),
         (
             ["regenerator.upscale.x2=a.param", "regenerator/upscale=ncnn"],
             r"upscale\.x2 is a group of settings",
@@ -245,6 +252,19 @@ def test_common_scene_defaults_agree_with_the_schema() -> None:
 def test_mistakes_are_named_with_a_remedy(overrides: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         compose(overrides, plugins())
+
+
+def test_a_component_without_a_file_is_named() -> None:
+    loaded = plugins()
+    loaded.registry.provider = "sharp"
+    for kind in ("regenerator", "backbone"):
+        loaded.registry.add(kind, "doubled", object, dict)
+    for group in ("regenerator/upscale", "backbone"):
+        message = (
+            f"plugin sharp registers {group.partition('/')[0]} 'doubled', but no {group}/doubled.yaml is installed"
+        )
+        with pytest.raises(ConfigError, match=message):
+            compose([f"{group}=doubled"], loaded)
 
 
 def test_a_number_for_a_text_is_not_silently_taken() -> None:
@@ -284,7 +304,7 @@ def test_settings_that_a_run_is_older_than_can_be_asked_for(tmp_path: Path) -> N
         read_config(tmp_path / "config.yaml", plugins(), ["eval.lpips.net=alex"])
     with pytest.raises(ConfigError, match=r"metrics.perceptual has 'niqee'; choose from st_lpips_alex, "):
         read_config(tmp_path / "config.yaml", plugins(), [*words, "metrics.perceptual=[niqee]"])
-    with pytest.raises(ConfigError, match=r"metrics.perceptual takes a list: give metrics.perceptual=\[...\]"):
+    with pytest.raises(ConfigError, match=r"metrics.perceptual is 'niqe'; give a list of texts, such as 'metrics"):
         read_config(tmp_path / "config.yaml", plugins(), [*words, "metrics.perceptual=niqe"])
     (tmp_path / "list.yaml").write_text("- 1\n")
     with pytest.raises(ConfigError):

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib import resources
 from inspect import signature
 from pathlib import Path
@@ -15,10 +15,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsx.core.errors import ConfigError, first_line, nearest
 from gsx.core.files import expand_home
-from gsx.core.plugins import Plugins
+from gsx.core.plugins import Plugins, Registry
+from gsx.experiments.run_folder.general_options import GeneralOptions
 from gsx.experiments.runs.overrides import parse_overrides, refuse_absent_launcher, refuse_sweep, with_quoted_paths
 from gsx.experiments.runs.settings import Settings, settings_from
-from gsx.experiments.runs.typed import dotted, unknown_key
+from gsx.experiments.runs.typed import dotted, schema_keys, unknown_key
 
 NEWER = "replace" in signature(OmegaConf.register_resolver).parameters  # OmegaConf 2.4: an older function of this name
 register: Callable[..., None] = OmegaConf.register_resolver if NEWER else OmegaConf.register_new_resolver
@@ -67,7 +68,7 @@ class Compositions:
 
     def __init__(self, plugins: Plugins) -> None:
         self.plugins, self.session = plugins, hydra_session(plugins)
-        self.recent = lru_cache(MOST_KEPT)(compose_raw)
+        self.recent = lru_cache(MOST_KEPT)(partial(compose_raw, registry=plugins.registry))
 
     def __enter__(self) -> "Compositions":
         self.session.__enter__()
@@ -131,7 +132,7 @@ def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
         ConfigError: a group, option, key or value is wrong; the nearest right one is named.
     """
     with hydra_session(plugins):
-        settings = settings_from(compose_raw(overrides), plugins)
+        settings = settings_from(compose_raw(overrides, plugins.registry), plugins)
     for key in ("output", "folder"):  # Hydra and quoted words do not expand ~
         path = getattr(settings.general, key)
         if path == "~" or path.startswith("~/"):
@@ -139,20 +140,23 @@ def compose(overrides: Sequence[str], plugins: Plugins) -> Settings:
     return settings
 
 
-def compose_raw(overrides: Sequence[str]) -> DictConfig:
-    """Return Hydra's composition inside a `hydra_session`; raise its errors as ConfigError."""
+def compose_raw(overrides: Sequence[str], registry: Registry | None = None) -> DictConfig:
+    """Return Hydra's composition inside a `hydra_session`; raise its errors as ConfigError.
+
+    registry: components, for errors about those without a file.
+    """
     from hydra import compose as hydra_compose
     from hydra.errors import HydraException
 
     overrides = with_quoted_paths(overrides)
-    check_groups(overrides)
+    check_groups(overrides, registry)
     try:
         return hydra_compose("config", overrides=overrides)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(explain(error, overrides)) from error
 
 
-def check_groups(overrides: Sequence[str]) -> None:
+def check_groups(overrides: Sequence[str], registry: Registry | None = None) -> None:
     """Refuse unknown groups and options with the nearest match, which Hydra does not name."""
     groups = known_groups()
     for override in parse_overrides(overrides):
@@ -166,12 +170,24 @@ def check_groups(overrides: Sequence[str]) -> None:
         if key == "hydra/launcher":
             refuse_absent_launcher(str(override.value()))
         if key in (*groups, "module"):
-            check_choices(key, override.value(), groups)
+            check_choices(key, override.value(), groups, registry)
+        elif override.is_add() or override.is_force_add():
+            check_added(key, groups, forced=override.is_force_add())
 
 
-def check_choices(group: str, value: Any, groups: Sequence[str]) -> None:
+def check_added(key: str, groups: Sequence[str], forced: bool) -> None:
+    """Refuse `+KEY=VALUE` at the top for a key that exists, unless forced (`++`), or that no schema has."""
+    known = [name for name in schema_keys(GeneralOptions) if "." not in name]
+    if key in known and not forced:
+        raise ConfigError(f"'+{key}': {key} has a value already, leave out the +")
+    if "." not in key and key not in known:
+        raise ConfigError(unknown_key(key, [*groups, *known]))
+
+
+def check_choices(group: str, value: Any, groups: Sequence[str], registry: Registry | None = None) -> None:
     """Refuse options that a group does not have, or one that is chosen twice."""
     options = listed(group)
+    refuse_without_file(group, value, options, registry)
     if not options:
         inner = ", ".join(one for one in groups if one.startswith(f"{group}/"))
         raise ConfigError(f"{group} is chosen by role: {inner}" if inner else f"no installed plugin has a {group}")
@@ -181,6 +197,18 @@ def check_choices(group: str, value: Any, groups: Sequence[str]) -> None:
             raise ConfigError(f"Unknown {group} '{name}'. Choose from {', '.join(options)}.{nearest(name, options)}")
         if name in names[:index]:
             raise ConfigError(f"{group}=[{','.join(names)}] names {name} twice: leave one out")
+
+
+def refuse_without_file(group: str, value: Any, options: Sequence[str], registry: Registry | None) -> None:
+    """Refuse a registered component whose plugin has no file for it in the configuration."""
+    components = registry.of(group.partition("/")[0]) if registry else {}
+    for name in map(str, value if isinstance(value, list) else [value]):
+        if name in components and name not in options:
+            raise ConfigError(
+                f"plugin {components[name].provider} registers {components[name].kind} '{name}', but no "
+                f"{group}/{name}.yaml is installed: add that file to its configuration (gsx_config_paths) and to its "
+                "package data"
+            )
 
 
 def known_groups() -> list[str]:
@@ -205,7 +233,7 @@ def explain(error: Exception, overrides: Sequence[str]) -> str:
     if not found:
         return f"the configuration cannot be composed: {first_line(error)}"
     key = (found.group(1) or found.group(2)).lstrip("+~")
-    known = known_keys(overrides)
+    known = [*known_keys(overrides), *known_groups()]
     if key in known:  # an open mapping, such as arguments of a function
         return f"'{key}' takes its entries one by one: '+{key}.NAME=VALUE'"
     return unknown_key(key, known)

@@ -1,24 +1,23 @@
 """Explains a configuration key: its value, its type and range, the files that set it, and their comments."""
 
 import re
-import types
 from collections.abc import Sequence
-from dataclasses import MISSING, dataclass, is_dataclass
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 from textwrap import shorten
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
 import yaml
 
 from gsx.core.errors import ConfigError, command
 from gsx.core.plugins import Plugins
-from gsx.core.ranges import Range, parts_of
 from gsx.experiments.run_folder.general_options import GeneralOptions
 from gsx.experiments.runs.compose import Compositions, Source, known_groups, listed
 from gsx.experiments.runs.settings import COMPETITOR, Settings
-from gsx.experiments.runs.typed import dotted, unknown_key
+from gsx.experiments.runs.typed import dotted, kind_in, unknown_key, value_at
 
-KINDS = {int: "whole number", float: "number", str: "text", bool: "true or false", Path: "path"}
+WORDS = {"scene": "scene={}", "backbone": "backbone={}", "augmenter": "augmenter=[{}]", "experiment": "+experiment={}"}
+"""Choices by groups whose options have keys of their own."""
 WIDTH = 110
 """Characters of a comment that shares a line with a key or an option."""
 
@@ -70,8 +69,8 @@ def explain(key: str, overrides: Sequence[str], plugins: Plugins) -> list[str]:
 def key_of_another_choice(key: str, overrides: Sequence[str], compositions: Compositions) -> str:
     """Return an error that names a composition which has the key, such as scene=photos; empty: none has."""
     group = key.partition(".")[0]
-    for name in listed(group) if group in ("scene", "backbone", "augmenter") else ():
-        word = f"{group}=[{name}]" if group == "augmenter" else f"{group}={name}"
+    for name in listed(group) if group in WORDS else ():
+        word = WORDS[group].format(name)
         try:
             found = key in dotted(compositions.values([*overrides, word]))
         except ConfigError:  # an option that needs others
@@ -96,15 +95,6 @@ def included(group: str, files: Sequence[Parsed]) -> set[Path]:
     ]
     plain = [(file, base.partition("@")[0].removeprefix(f"/{group}/")) for file, base in bases if isinstance(base, str)]
     return {file.with_name(f"{base}.yaml") for file, base in plain if "/" not in base}
-
-
-def value_at(key: str, node: Any) -> Any:
-    """Return the value of a dotted key; MISSING: there is none."""
-    for part in key.split("."):
-        if not isinstance(node, dict) or part not in node:
-            return MISSING
-        node = node[part]
-    return node
 
 
 def written(value: Any) -> str:
@@ -213,29 +203,3 @@ def schemas(settings: Settings) -> dict[str, type]:
     found = {f"{key}.": type(options) for key, options in single.items()}
     found |= {f"{key}.": one.component.options for key, one in chosen.items()}
     return found | {"": GeneralOptions}
-
-
-def kind_in(schema: type, parts: Sequence[str]) -> str:
-    """Return type and range of a field of a dataclass in words."""
-    hints = get_type_hints(schema, include_extras=True)
-    if parts[0] not in hints:
-        return ""
-    hint = hints[parts[0]]
-    if len(parts) > 1:
-        inner = next((part for part in parts_of(hint) if isinstance(part, type) and is_dataclass(part)), None)
-        return kind_in(inner, parts[1:]) if inner else ""
-    bounds = next((part for part in parts_of(hint) if isinstance(part, Range)), None)
-    return f"{in_words(hint)}{f' {bounds}' if bounds else ''}"
-
-
-def in_words(hint: Any) -> str:
-    """Return a type in words; empty for others than plain types, their unions and lists."""
-    origin, inner = get_origin(hint), list(get_args(hint))
-    if origin in (Union, types.UnionType):
-        words = [in_words(part) for part in inner if part is not type(None)]
-        return " or ".join([*filter(None, words), *(["null"] if type(None) in inner else [])])
-    if origin in (list, tuple):
-        return f"list of {in_words(inner[0])}s"
-    if hasattr(hint, "__metadata__"):
-        return in_words(inner[0])
-    return KINDS.get(hint, "")

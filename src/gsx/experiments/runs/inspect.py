@@ -154,7 +154,9 @@ def training_command(loader: Component, path: Path, overrides: Mapping[str, str]
 def options_for(loader: Component, path: Path, overrides: Mapping[str, str], plugins: Plugins) -> Any:
     """Return the scene options of that command."""
     with hydra_session(plugins):
-        node = OmegaConf.merge(compose_raw([f"scene={loader.name}"]).scene, {"path": str(path)} | dict(overrides))
+        node = OmegaConf.merge(
+            compose_raw([f"scene={loader.name}"], plugins.registry).scene, {"path": str(path)} | dict(overrides)
+        )
     return typed(loader.options, OmegaConf.to_container(node, resolve=True), "scene")
 
 

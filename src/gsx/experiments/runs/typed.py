@@ -4,16 +4,22 @@ import copy
 import dataclasses
 import math
 import re
-from collections.abc import Iterable, Iterator
+import types
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
-from typing import Any
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsx.core.errors import ConfigError, first_line, nearest
-from gsx.core.ranges import beyond_range
+from gsx.core.ranges import Range, beyond_range, parts_of
 from gsx.experiments.run_folder.renamed import advice
+
+KINDS = {int: "whole number", float: "number", str: "text", bool: "true or false", Path: "path"}
+EXAMPLES = (10, 1, 2, 0)
+"""Numbers for examples; the first in the range of an option."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,12 +90,28 @@ def complaint(error: OmegaConfBaseException, schema: type, path: str, values: di
     key, text = ".".join(part for part in (path, inner) if part), first_line(error)
     if type(error).__name__ == "ConfigKeyError":
         return unknown_key(key, [f"{path}.{k}".lstrip(".") for k in schema_keys(schema)])
-    if "is not a ListConfig" in text:
-        return f"{key} takes a list: give {key}=[...], with commas between its values"
+    if problem := wrong_type(schema, path, inner, values):
+        return problem
+    if text.startswith("Cannot assign") and " to Dict[" in text:
+        return f"{key} is a group of settings, not a value: give {key}.NAME=VALUE"
     if (group := re.search(r"is not a subclass of (\w+)", text)) is not None:
         key = ".".join([part for part in (path, key_of_type(schema, group[1], values)) if part]) or key
         return f"{key} is a group of settings, not a value: give {key}.NAME=VALUE"
     return f"{key}: {text}"
+
+
+def wrong_type(schema: type, path: str, inner: str, values: dict[str, Any]) -> str:
+    """Return an error for a value of another type than its field's; empty: that is no plain type, or not the reason."""
+    name = re.sub(r"\[\d+\]", "", inner)
+    value, hint = value_at(name, values), hint_at(schema, name.split("."))
+    kind, example = kind_in(schema, name.split(".")), example_of(hint)
+    if not kind or value is dataclasses.MISSING:
+        return ""
+    key = ".".join(part for part in (path, name) if part)
+    article = "" if kind.startswith(("text", "true")) else "a "
+    word = f"{key}={example}"
+    such = f", such as {repr(word) if '[' in word else word}" if example else ""
+    return f"{key} is {'null' if value is None else repr(value)}; give {article}{kind}{such}"
 
 
 def key_of_type(schema: type, name: str, values: Any, prefix: str = "") -> str:
@@ -136,3 +158,60 @@ def texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
         yield from texts(one, f"{key}.{name}".lstrip("."))
     if isinstance(value, str):
         yield key, value
+
+
+def value_at(key: str, node: Any) -> Any:
+    """Return the value of a dotted key; dataclasses.MISSING: there is none."""
+    for part in key.split("."):
+        if not isinstance(node, dict) or part not in node:
+            return dataclasses.MISSING
+        node = node[part]
+    return node
+
+
+# -- types ---------------------------------------------------------------------------------------------------------
+
+
+def hint_at(schema: type, parts: Sequence[str]) -> Any:
+    """Return the type of a field of a dataclass, with its range; None: there is no such field."""
+    hint = get_type_hints(schema, include_extras=True).get(parts[0])
+    if len(parts) == 1 or hint is None:
+        return hint
+    kinds = list(parts_of(hint))
+    inner = next((part for part in kinds if isinstance(part, type) and dataclasses.is_dataclass(part)), None)
+    return hint_at(inner, parts[1:]) if inner else next((kind for kind in (float, int, str) if kind in kinds), None)
+
+
+def bounds_of(hint: Any) -> Range | None:
+    """Return the range of a type's numbers."""
+    return next((part for part in parts_of(hint) if isinstance(part, Range)), None)
+
+
+def kind_in(schema: type, parts: Sequence[str]) -> str:
+    """Return type and range of a field of a dataclass in words; empty: there is no such field, or no plain type."""
+    hint = hint_at(schema, parts)
+    bounds = bounds_of(hint)
+    return f"{in_words(hint)}{f' {bounds}' if bounds else ''}"
+
+
+def example_of(hint: Any) -> str:
+    """Return a value for a number or a list; empty for other types."""
+    kinds, bounds = list(parts_of(hint)), bounds_of(hint)
+    several, numbers = any(get_origin(kind) is list for kind in kinds), int in kinds or float in kinds
+    fitting = [number for number in EXAMPLES if bounds is None or number in bounds]
+    if several:
+        return f"[{','.join(map(str, [number for number in fitting if 0 < number < 10]))}]" if numbers else "[A,B]"
+    return f"{fitting[0]}" if numbers and fitting else ""
+
+
+def in_words(hint: Any) -> str:
+    """Return a type in words; empty for others than plain types, their unions and lists."""
+    origin, inner = get_origin(hint), list(get_args(hint))
+    if origin in (Union, types.UnionType):
+        words = [in_words(part) for part in inner if part is not type(None)]
+        return " or ".join([*filter(None, words), *(["null"] if type(None) in inner else [])])
+    if origin in (list, tuple):
+        return f"list of {in_words(inner[0])}s"
+    if hasattr(hint, "__metadata__"):
+        return in_words(inner[0])
+    return KINDS.get(hint, "")
