@@ -13,6 +13,7 @@ from gsx.core.data.scene import Scene
 from gsx.engine.compile_ahead import Step
 from gsx.experiments.runs import early_compiling
 from gsx.experiments.runs.early_compiling import compiling_before, early_step
+from gsx.experiments.runs.logs import set_up_logging
 from gsx.experiments.runs.open import start
 from gsx.experiments.runs.rasterizer_path import rules_of_step
 from gsx.experiments.runs.settings import Settings
@@ -34,10 +35,14 @@ COMPILED = ("rasterizer=compiled",)
         "backbone=octree_scaffold",
     ],
 )
-def test_the_placeholder_has_the_rules_of_the_run(tmp_path: Path, given: str) -> None:
+def test_the_placeholder_has_the_rules_of_the_run(
+    tmp_path: Path, given: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    set_up_logging()
     settings = tiny_settings(tmp_path / "run", *given.split(), *COMPILED)
     torch.manual_seed(5)
     step, drawn = early_step(settings), torch.rand(1)
+    assert not capsys.readouterr().err, "a doubt about the placeholder"
     assert step is not None
     torch.manual_seed(5)
     assert torch.equal(torch.rand(1), drawn)  # torch's generator is as before

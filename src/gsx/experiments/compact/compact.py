@@ -113,7 +113,7 @@ def opened(target: Path, overrides: Sequence[str], plugins: Plugins) -> tuple[Ru
         InputError: the run is not finished, or was never trained.
     """
     if target.is_dir():
-        run, settings = open_run(target, plugins, overrides)
+        run, settings = open_run(target, plugins, overrides, evaluating=True)
         if not run.complete:
             raise InputError(
                 f"{target} is at step {run.step} of {run.iterations}: `{command('resume', target)}` finishes it first"

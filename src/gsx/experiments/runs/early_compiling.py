@@ -72,12 +72,24 @@ def early_step(settings: Settings) -> Step | None:
         begins=False,
     )
     try:
-        with torch.random.fork_rng(devices=[]):
+        with torch.random.fork_rng(devices=[]), quiet():
             backbone = settings.backbone.component.factory(settings.backbone.options, context)
     except Exception as error:  # a plugin may need more than one point; a wrong option is refused later
         logger.info("compiling waits for the scene (%s)", first_line(error))
         return None
     return rules_of_step(backbone, backbone.raster)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Suppress the messages of gsx inside the context."""
+    package = logging.getLogger("gsx")
+    before = package.level
+    package.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        package.setLevel(before)
 
 
 def placeholder_scene() -> Scene:

@@ -6,7 +6,7 @@ import os
 import platform
 import sys
 from collections.abc import Collection, Sequence
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, entry_points, version
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import torch
 
 from gsx import __version__
 from gsx.core.data.scene import View
-from gsx.core.plugins import Plugins
+from gsx.core.plugins import GROUP, Plugins
 from gsx.core.training.backbone import CAUTION
 from gsx.core.training.run import Run
 from gsx.engine.cache import source_revision
@@ -45,6 +45,7 @@ def environment(run: Run, plugins: Plugins, idle: Collection[str]) -> dict[str, 
         "processes": run.ranks.size,
         "packages": {name: installed_version(name) for name in PACKAGES},
         "plugins": plugins.versions,
+        "distributions": distributions(plugins.versions),
         "options": composition_key(run.config, "", idle),
         "plan": plan_of(run),
         "training_focal": max(view.camera.focal for view in scene.train),
@@ -80,6 +81,11 @@ def installed_version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "not installed"
+
+
+def distributions(names: Collection[str]) -> dict[str, str]:
+    """Return the distributions that plugins were installed by, by plugin."""
+    return {point.name: point.dist.name for point in entry_points(group=GROUP) if point.dist and point.name in names}
 
 
 def announce(run: Run, plugins: Plugins) -> None:

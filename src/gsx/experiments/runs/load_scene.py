@@ -35,6 +35,7 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
             and points are all in one place.
     """
     options = settings.scene.options
+    refuse_absent_scene(settings)
     loaded = checked(settings.scene.component.factory(options), settings.scene.component.name)
     loaded = replace(loaded, notes=[*loaded.notes, *count_notes(settings)])
     unit = getattr(options, "unit", 1.0)
@@ -52,6 +53,18 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
         generator = torch.Generator().manual_seed(derived_seed("fill", settings.general.seed))
         scene = fill_gaps(scene, count, generator)
     return degrade(scene, getattr(options, "disturb", {}))
+
+
+def refuse_absent_scene(settings: Settings) -> None:
+    """Raise InputError for a scene of a folder that is not named or does not exist."""
+    path, data = getattr(settings.scene.options, "path", None), settings.dataset
+    if settings.scene.component.scene_format is None or path is None:
+        return
+    if not path:
+        raise InputError("scene.path is empty: give scene.path=FOLDER")
+    if not expand_home(path).exists():
+        listing = f"; `gsx datasets {data.name} data_root=FOLDER` lists the files below it" if data else ""
+        raise InputError(f"scene.path: '{path}' does not exist: check {'data_root' if data else 'its name'}{listing}")
 
 
 def held_out_none(scene: Scene, rule: str) -> Scene:

@@ -32,12 +32,12 @@ from gsx.experiments.runs.early_compiling import compiling_before
 from gsx.experiments.runs.environment import environment
 from gsx.experiments.runs.file_axes import start_in_scene
 from gsx.experiments.runs.history import record_changes
-from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.load_scene import load_scene, refuse_absent_scene
 from gsx.experiments.runs.overrides import key_of
 from gsx.experiments.runs.progress import read_curves
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.saved_settings import read_config, value_of, write_config
-from gsx.experiments.runs.settings import COMPETITOR, Settings, named_code
+from gsx.experiments.runs.settings import COMPETITOR, SEVERAL, Settings, named_code
 from gsx.experiments.runs.start_file import starting_splats
 from gsx.experiments.runs.tracking import build_trackers
 from gsx.experiments.runs.verified import verified
@@ -88,6 +88,7 @@ def refuse_early(settings: Settings) -> None:
     """Raise ConfigError or InputError for settings that cannot train, before the scene is loaded."""
     ranks = current_ranks()
     choose_device(settings.general.device)
+    refuse_absent_scene(settings)
     ranks.broadcast(lambda: refuse_used(settings.general.folder))
     refuse_uneven(settings.training.batch, ranks)
     load_lpips(settings.evaluation.lpips)  # refuses wrong weights now, not after training
@@ -152,6 +153,8 @@ def refuse_other(folder: Path) -> None:
     if folder.is_file():
         name = "" if suffix_of(folder) else f". If it holds splats, let its name end in one of {', '.join(SUFFIXES)}"
         raise InputError(f"{folder} is a file, not a run folder: give a folder that `gsx` made{name}")
+    if not folder.exists():
+        raise InputError(f"'{folder}' does not exist: give a run folder")
     if not (folder / "config.yaml").is_file():
         raise InputError(f"{folder} is not a run folder (it has no config.yaml): give a folder that `gsx` made")
 
@@ -181,18 +184,25 @@ def refuse_code(folder: Path, settings: Settings, overrides: Sequence[str], eval
 
 
 def open_run(
-    folder: Path, plugins: Plugins, overrides: Sequence[str] = (), training: bool = False, trusted: bool = False
+    folder: Path,
+    plugins: Plugins,
+    overrides: Sequence[str] = (),
+    training: bool = False,
+    trusted: bool = False,
+    evaluating: bool = False,
 ) -> tuple[Run, Settings]:
     """Return a run at its newest checkpoint, and its settings.
 
-    training: it will be trained. trusted: it may run code that its settings name.
+    training: it will be trained. trusted: it may run code that its settings name. evaluating: it will be evaluated.
+    Otherwise the plugins of augmenters, regenerators and trackers need not be installed.
 
     Raises:
         InputError: the folder is not a run, or names code and is not trusted.
         CheckpointError: there is no usable checkpoint.
     """
     refuse_other(folder)
-    settings = read_config(folder / "config.yaml", plugins, overrides)
+    spare = () if training else SEVERAL if evaluating else (*SEVERAL, COMPETITOR)
+    settings = read_config(folder / "config.yaml", plugins, overrides, spare)
     if training and not trusted:
         refuse_code(folder, settings, overrides)
     return restored(settings, folder, training), settings
@@ -210,7 +220,7 @@ def reopened(folder: Path, plugins: Plugins, overrides: Sequence[str]) -> Iterat
     refuse_training(folder, overrides)
     with claimed(folder):
         remove_partial(folder)
-        run, settings = open_run(folder, plugins, overrides)
+        run, settings = open_run(folder, plugins, overrides, evaluating=True)
         run.raster = as_trained(run)
         warm(run)
         yield run, settings

@@ -1,7 +1,7 @@
 """config.yaml of a run folder: written, read back with overrides, and translated from older versions."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from gsx.core.rasterizer.settings import OF_BACKBONES
 from gsx.core.training.run import TrainingOptions
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.lpips import LpipsOptions
-from gsx.experiments.run_folder.files import part
+from gsx.experiments.run_folder.files import part, read_run
 from gsx.experiments.run_folder.general_options import GeneralOptions
 from gsx.experiments.run_folder.renamed import renamed
 from gsx.experiments.runs.compose import Compositions
@@ -25,6 +25,7 @@ from gsx.experiments.runs.settings import (
     COMPONENT_KINDS,
     SEVERAL,
     Settings,
+    plain_values,
     settings_from,
     strict_node,
 )
@@ -36,11 +37,13 @@ def write_config(path: Path, resolved: dict[str, Any]) -> None:
     replace_text(path, OmegaConf.to_yaml(OmegaConf.create(resolved)))
 
 
-def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> Settings:
+def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = (), spare: Collection[str] = ()) -> Settings:
     """Return the settings of a run, with `key=value` overrides of its keys and of keys that gsx has added since.
 
+    spare: kinds (of SEVERAL, COMPETITOR) whose components are left out of the settings if no plugin provides them.
+
     Raises:
-        ConfigError: the file is unreadable, or an override names no such key.
+        ConfigError: the file is unreadable, an override names no such key, or no plugin provides a component.
     """
     config = with_newer_settings(saved_config(path))
     for override in overrides:
@@ -57,7 +60,53 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> 
             OmegaConf.update(config, key, value_of(value), force_add=True)
         except Exception as error:  # the YAML parser has its own family of errors
             raise ConfigError(f"override '{override}' cannot be read: {first_line(error)}") from error
-    return settings_from(config, plugins)
+    return settings_without(absent_nodes(config, plugins), config, plugins, path.parent, spare)
+
+
+def absent_nodes(config: DictConfig, plugins: Plugins) -> dict[str, tuple[str, str]]:
+    """Return (kind, name) of the components that no plugin provides, by dotted key."""
+    values: Any = OmegaConf.to_container(config)
+    nodes = {kind: (kind, part(values, kind)) for kind in COMPONENT_KINDS if part(values, kind)}
+    for kind in SEVERAL:
+        nodes |= {f"{kind}.{name}": (kind, node) for name, node in part(values, kind).items() if isinstance(node, dict)}
+    if upscaler := part(part(values, "eval"), "competitor"):
+        nodes[COMPETITOR] = ("regenerator", upscaler)
+    options = {entry.name for entry in dataclasses.fields(TrainingOptions)}
+    for name, node in part(values, "training").items():
+        if isinstance(node, dict) and name not in options:
+            nodes[f"training.{name}"] = ("module", {"name": name})
+    named = {key: (kind, str(node.get("name", ""))) for key, (kind, node) in nodes.items()}
+    return {key: one for key, one in named.items() if one not in plugins.registry.components}
+
+
+def settings_without(
+    absent: dict[str, tuple[str, str]], config: DictConfig, plugins: Plugins, folder: Path, spare: Collection[str]
+) -> Settings:
+    """Return settings without absent nodes of spare kinds; `resolved` has them. Raise ConfigError for other nodes."""
+    for key, (_, name) in absent.items():
+        if key not in spare and key.partition(".")[0] not in spare:
+            remedy = plugin_remedy(folder, plugins) + f", or leave it out by {COMPETITOR}=null" * (key == COMPETITOR)
+            raise ConfigError(f"{key} is '{name}', which no plugin provides: {remedy}")
+    if not absent:
+        return settings_from(config, plugins)
+    rest = config.copy()
+    for group, _, name in (key.rpartition(".") for key in absent):
+        OmegaConf.select(rest, group).pop(name)
+    return dataclasses.replace(settings_from(rest, plugins), resolved=plain_values(config))
+
+
+def plugin_remedy(folder: Path, plugins: Plugins) -> str:
+    """Return which plugin to install for a run, by its environment.json and the plugins that failed to load."""
+    environment = read_run(folder).environment
+    names = part(environment, "distributions")
+    others = {name: of for name, of in part(environment, "plugins").items() if plugins.versions.get(name) != of}
+    failed = [f"{one.plugin} did not load ({one.reason})" for one in plugins.failures if one.plugin in others]
+    if failed:
+        return f"{', '.join(failed)}: correct that plugin"
+    known = ", ".join(f"{names.get(name, name)} {version}" for name, version in others.items())
+    return (
+        f"install {known}, with which the run was trained" if known else "install the plugin that it was trained with"
+    )
 
 
 def composed_competitor(override: str, plugins: Plugins) -> dict[str, Any]:
@@ -93,14 +142,14 @@ def newer_keys(config: DictConfig, plugins: Plugins) -> Iterator[str]:
     nodes = {kind: (kind, part(values, kind)) for kind in COMPONENT_KINDS}
     for kind in SEVERAL:
         nodes |= {f"{kind}.{name}": (kind, node) for name, node in part(values, kind).items() if isinstance(node, dict)}
-    schemas |= {
-        key: plugins.registry.find(kind, str(node.get("name", ""))).options for key, (kind, node) in nodes.items()
-    }
+    registered = plugins.registry.components
+    components = {key: registered.get((kind, str(node.get("name", "")))) for key, (kind, node) in nodes.items()}
+    schemas |= {key: component.options for key, component in components.items() if component}
     yield from schema_keys(GeneralOptions)
     yield COMPETITOR
-    if isinstance(upscaler := part(values, "eval").get("competitor"), dict):
-        options = plugins.registry.find("regenerator", str(upscaler.get("name", ""))).options
-        yield from schema_keys(options, f"{COMPETITOR}.")
+    upscaler = part(part(values, "eval"), "competitor")
+    if component := registered.get(("regenerator", str(upscaler.get("name", "")))):
+        yield from schema_keys(component.options, f"{COMPETITOR}.")
     for key, schema in schemas.items():
         yield from (name for name in schema_keys(schema, f"{key}.") if not name.startswith(("eval.lpips", "eval.perc")))
     yield from ("metrics.perceptual", "metrics.perceptual_pixels")
