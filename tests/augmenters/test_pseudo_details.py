@@ -496,7 +496,8 @@ def test_the_share_of_consistent_pixels_is_told(
     augmenter_of(run).term(run, 45, 0)
     share = load_views(augmenter_of(run).store.path(run, 44))[1]["consistent"]
     assert share == 1.0 if least else 0.0 < share < 0.9
-    assert f"{100 * share:.1f}% consistent pixels" in caplog.text
+    line = "step 44, upscale: enlarged photos, reduced again, equal the photo in"
+    assert f"{line} {100 * share:.1f} % of its pixels" in caplog.text
 
 
 # -- regenerators that fail --------------------------------------------------------------------------------------------

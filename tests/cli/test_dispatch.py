@@ -44,6 +44,7 @@ def test_help_is_short_says_what_to_type_and_does_not_import_torch() -> None:
     assert result.returncode == 0
     assert len(result.stdout.splitlines()) <= 30
     assert "start here" in result.stdout
+    assert re.search(r"without it photos take 10 minutes on a CPU;\s+length=published trains all 30,000", result.stdout)
     for verb in ("resume", "eval", "render", "export", "report", "scenes", "plugins"):
         assert f"gsx {verb}" in result.stdout
 
@@ -71,6 +72,8 @@ def test_train_prints_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert main(words(tmp_path / "run", *FEW, "iterations=2")) == 0
     captured = capsys.readouterr()
     assert captured.out.strip() == str(tmp_path / "run" / "report.html")
+    assert captured.err.count("LPIPS is not measured without weights") == 1
+    assert captured.err.index("evaluating") < captured.err.index("LPIPS")
     assert re.search(r"step 2/2 .* it/s .* ETA .* loss .* PSNR .* splats .* MB", captured.err)
     assert "schedule of densify" in (tmp_path / "run" / "log.txt").read_text() + captured.err
 
@@ -137,7 +140,7 @@ def test_help_of_a_verb_does_not_import_torch() -> None:
 
 @pytest.mark.parametrize("name", ["x.ksplat", "x.splat", "x", "x.ply.gz"])
 def test_only_what_can_be_written_is_exported(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", str(tmp_path / "no_run"), str(tmp_path / name)]) == 2
+    assert main(["export", str(tmp_path), str(tmp_path / name)]) == 2
     told = capsys.readouterr().err
     assert f"{name} is not written: gsx writes .compressed.ply, .ply, .spz, .sog, .glb, .html alone" in told
     assert len(told.splitlines()) == 1
@@ -146,6 +149,11 @@ def test_only_what_can_be_written_is_exported(name: str, tmp_path: Path, capsys:
 def test_config_can_be_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scene=colmap", "--cfg", "job"]) == 0
     assert "max_reprojection_px" in capsys.readouterr().out
+
+
+def test_flags_and_words_come_in_any_order(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scene=colmap", "--cfg", "job", "seed=7", "--resolve"]) == 0
+    assert "seed: 7\n" in capsys.readouterr().out
 
 
 def test_values_that_follow_from_others_can_be_printed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -428,7 +436,45 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
         lambda t: words(t / "run", "training.exposure=3"),
         "training.exposure is 3, but it is a group of settings: give training.exposure.NAME=VALUE",
     ),
-    "a word for a list": (lambda t: words(t / "run", "eval.zoom=abc"), "eval.zoom takes a list: give eval.zoom=[...]"),
+    "a word for a list": (lambda t: words(t / "run", "eval.zoom=abc"), "eval.zoom is 'abc'; give a list of numbers"),
+    "a folder that is not first": (
+        lambda t: ["preset=zoom_prior", str(empty_folder(t / "my photos"))],
+        "/my photos' is a folder: put it first, `gsx '",
+    ),
+    "a folder after a flag": (lambda t: ["--cfg", "job", str(empty_folder(t / "one"))], "/one --cfg job`"),
+    "a word that is nothing": (lambda t: ["minutes=10", "nothing"], "'nothing' is neither a setting (KEY=VALUE) nor a"),
+    "a setting with dashes": (lambda t: ["--iterations=20"], "settings have no dashes, write iterations=20"),
+    "dashes and a space": (lambda t: ["--iterations", "20"], "Settings have no dashes: iterations=VALUE."),
+    "dashes with a folder": (lambda t: [str(t), "--minutes=10"], "settings have no dashes, write minutes=10"),
+    "dashes in an evaluation": (
+        lambda t: ["eval", str(t), "--eval.zoom=[1,2]"],
+        "gsx eval: '--eval.zoom=[1,2]': settings have no dashes, write eval.zoom=[1,2]",
+    ),
+    "a table with a typo": (lambda t: ["+experimnt=x"], "Unknown key 'experimnt'. Did you mean 'experiment'?"),
+    "a plus too many": (lambda t: ["+iterations=5"], "'+iterations': iterations has a value already, leave out the +"),
+    "a typo that is printed": (lambda t: ["--cfg", "job", "backbone=gs3"], "Unknown backbone 'gs3'. Choose from"),
+    "an unknown table that is printed": (
+        lambda t: ["experiment=no", "--cfg", "job"],
+        "Unknown experiment 'no'. Choose",
+    ),
+    "nothing near": (lambda t: ["explain", "nonsense"], "Unknown key 'nonsense'. `gsx --cfg job` lists all keys."),
+    "a key of tables": (lambda t: ["explain", "experiment.seeds"], "is a setting of +experiment="),
+    "a scene without a folder": (
+        lambda t: ["scene=colmap", "iterations=10"],
+        "scene.path is empty: give scene.path=FOLDER",
+    ),
+    "a dataset that is not there": (
+        lambda t: ["dataset=bungeenerf", "dataset.scene=rome", f"data_root={t}"],
+        "does not exist: check data_root; `gsx datasets bungeenerf data_root=FOLDER` lists the files",
+    ),
+    **{
+        f"{verb} of nothing": (lambda t, verb=verb: [verb, "nowhere"], "'nowhere' does not exist: give a run folder")
+        for verb in ("eval", "export", "render", "view", "compact", "resume", "photographs")
+    },
+    "a suffix with a typo": (
+        lambda t: ["export", str(t), str(t / "model.htm")],
+        "model.htm is not written: gsx writes .compressed.ply, .ply, .spz, .sog, .glb, .html alone. Did you mean",
+    ),
     "a value for hydra": (lambda t: words(t / "run", "hydra=3"), "give hydra.NAME=VALUE or hydra/GROUP=NAME"),
     "several values for one run": (
         lambda t: words(t / "run", "scene.split=files:a.txt,b.txt"),
@@ -488,7 +534,7 @@ TOLD: dict[str, tuple[Callable[[Path], list[str]], str]] = {
         "--to FOLDER is for pictures",
     ),
     "frames of no orbit": (lambda t: ["render", str(t / "run"), "--frames", "3"], "go with --orbit FILE"),
-    "axes of no spz": (lambda t: ["export", str(t / "run"), str(t / "x.ply"), "--axes", "rdf"], "are for .spz files"),
+    "axes of no spz": (lambda t: ["export", str(t), str(t / "x.ply"), "--axes", "rdf"], "are for .spz files"),
     "a choice that is there twice": (
         lambda t: words(t / "run", "iterations=1", "augmenter=[upscale,bootstrap,upscale]"),
         "augmenter=[upscale,bootstrap,upscale] names upscale twice: leave one out",

@@ -33,7 +33,7 @@ from gsx.scenes.photos import find_photos
 def trained(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """Words of what would be trained."""
     given: list[list[str]] = []
-    monkeypatch.setattr(folders, "train", lambda words: given.append(words) or 0)
+    monkeypatch.setattr(folders, "train", lambda words, of_folder: given.append(words) or 0)
     return given
 
 
@@ -51,6 +51,23 @@ def test_a_colmap_folder_and_photos_are_told_apart(
     assert photos.scene.component.name == "photos"
     told = [shlex.split(line) for line in capsys.readouterr().err.splitlines() if line.startswith("gsx scene=")]
     assert told == [["gsx", *words] for words in trained], "it can be pasted"
+
+
+def test_the_settings_of_a_folder_can_be_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_photos(synthesize(), tmp_path / "photos")
+    assert main([str(tmp_path / "photos"), "--cfg", "job", "device=cpu"]) == 0
+    out = capsys.readouterr().out
+    assert f"path: {tmp_path / 'photos'}\n" in out
+    assert "minutes: 10\n" in out
+
+
+def test_a_run_without_the_default_minutes_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_photos(synthesize(), tmp_path / "photos")
+    monkeypatch.setattr("gsx.experiments.runs.job.train", lambda settings, loaded, runs: runs.append(tmp_path) or 130)
+    main([str(tmp_path / "photos"), "preset=zoom_prior", "device=cpu"])
+    assert "no minutes=10 because of preset=zoom_prior: 30,000 steps\n" in capsys.readouterr().err
 
 
 def test_pictures_of_a_sog_are_no_photos(

@@ -243,7 +243,12 @@ def test_photos_share_a_camera_by_size_and_by_lens(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("names", "said"),
-    [([], "0 photos.*nothing"), (["a.heic", "b.heic"], r"0 photos.*\.heic.*JPEG"), (["a.jpg"], "1 photos.*at least 2")],
+    [
+        ([], "0 photos .*add photos"),
+        (["a.heic", "b.heic"], r"0 photos.*\.heic.*JPEG"),
+        (["a.jpg"], r"1 photo \(.*at least 2: add photos, 30 to 200 of a scene\.$"),
+        (["a.jpg", "b.psd"], r"add photos, 30 to 200 of a scene, or convert others to JPEG \(found: \.psd\)\.$"),
+    ],
 )
 def test_too_few_photos_are_refused_with_what_was_found(tmp_path: Path, names: list[str], said: str) -> None:
     for name in names:

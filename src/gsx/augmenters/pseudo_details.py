@@ -217,10 +217,16 @@ class PseudoDetails(Redrawing):
         shares = [view.provenance["consistent"] for view in views if "consistent" in view.provenance]
         if shares:
             facts["consistent"] = sum(shares) / len(shares)
-            logger.info("%s: %.1f%% consistent pixels", self.context.name, 100 * facts["consistent"])
+            logger.info(
+                "step %d, %s: enlarged photos, reduced again, equal the photo in %.1f %% of its pixels",
+                *(event, self.context.name, 100 * facts["consistent"]),
+            )
         if weights:
             facts["masked"] = 1 - (sum(weights) + len(views) - len(weights)) / len(views)
-            logger.info("%s: %.1f%% of the pixels do not count", self.context.name, 100 * facts["masked"])
+            logger.info(
+                "step %d, %s: pixel weights take %.1f %% of the pseudo views out of the loss",
+                *(event, self.context.name, 100 * facts["masked"]),
+            )
         return views, facts
 
 

@@ -1,12 +1,14 @@
 """Parsers of the commands. They run before torch is imported, so that help and mistakes are quick."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from gsx.core.errors import ConfigError, InputError, nearest
+from gsx.core.errors import ConfigError, InputError, command, nearest
+from gsx.core.files import expand_home
 from gsx.core.ranges import MOST_STEPS, ZOOMS, Range
+from gsx.experiments.runs.overrides import is_override
 from gsx.formats.axis_names import AUTO, CHOICES, SPECIFIED, TRAINED
 from gsx.formats.suffixes import READABLE, SPZ_VERSIONS, WRITTEN, splat_file_at
 
@@ -16,6 +18,8 @@ HYDRA_FLAGS = (
     *("--cfg", "-c", "-p", "--package", "--resolve"),
 )
 """Flags that Hydra handles."""
+VALUED_FLAGS = ("--cfg", "-c", "-p", "--package", "--info")
+"""Flags before a value."""
 MOST_FRAMES = 100_000
 """Frames of an orbit: its cameras are held in memory."""
 SPLAT_FILE = f"splat file: {READABLE}"
@@ -28,10 +32,13 @@ class Parser(argparse.ArgumentParser):
         super().__init__(
             prog=f"gsx {verb}", usage=usage and f"%(prog)s {usage}", description=description, allow_abbrev=False
         )
+        self.settings = False
+        """True: it takes KEY=VALUE."""
 
     def add_overrides(self, description: str) -> None:
         """Add any number of KEY=VALUE as `overrides`."""
         # with a default: argparse requires what has none
+        self.settings = True
         self.add_argument("overrides", nargs="*", default=[], metavar="KEY=VALUE", help=description)
 
     def add_axes(self, flag: str = "--axes") -> None:
@@ -41,6 +48,9 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise ConfigError."""
+        flag, equals, value = message.removeprefix("unrecognized arguments: ").split()[0].partition("=")
+        if self.settings and flag.startswith("-") and equals:
+            raise ConfigError(f"{self.prog}: {without_dashes(flag, value)}")
         raise ConfigError(f"{self.prog}: {message}. See {self.prog} --help")
 
 
@@ -92,16 +102,51 @@ def refuse_axes_of_run(verb: str, options: argparse.Namespace) -> None:
 
 
 def parse_train(arguments: list[str]) -> list[str]:
-    """Refuse unknown flags of `gsx OVERRIDES...`."""
-    for flag in (word for word in arguments if word.startswith("-")):
-        if flag.split("=")[0] not in HYDRA_FLAGS:
-            raise ConfigError(f"Unknown option '{flag}'.{nearest(flag, HYDRA_FLAGS)} See gsx --help")
+    """Refuse unknown flags of `gsx OVERRIDES...`, and words that are no overrides."""
+    for word in split_flags(arguments)[1]:
+        if not is_override(word):
+            raise ConfigError(misplaced(word, [other for other in arguments if other != word]))
     return arguments
+
+
+def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return (Hydra's flags with their values, other words); raise ConfigError for another flag."""
+    flags, others = list[str](), list[str]()
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        if word.startswith("-"):
+            refuse_flag(word)
+        (flags if word.startswith("-") or before in VALUED_FLAGS else others).append(word)
+    return flags, others
+
+
+def refuse_flag(word: str) -> None:
+    """Raise ConfigError for a flag that Hydra does not have."""
+    flag, equals, value = word.partition("=")
+    if flag in HYDRA_FLAGS:
+        return
+    if equals:
+        raise ConfigError(without_dashes(flag, value))
+    remedy = nearest(word, HYDRA_FLAGS) or f" Settings have no dashes: {flag.lstrip('-')}=VALUE."
+    raise ConfigError(f"Unknown option '{word}'.{remedy} See gsx --help")
+
+
+def without_dashes(flag: str, value: str) -> str:
+    """Return the error for a setting that is written as a flag."""
+    return f"'{flag}={value}': settings have no dashes, write {flag.lstrip('-')}={value}"
+
+
+def misplaced(word: str, others: Sequence[str]) -> str:
+    """Return the error for a word among overrides that is none; `others`: the other words."""
+    path = expand_home(word)
+    if path.exists():
+        kind = "folder" if path.is_dir() else "file"
+        return f"'{word}' is a {kind}: put it first, `{command(word, *others)}`"
+    return f"'{word}' is neither a setting (KEY=VALUE) nor a folder or file: check its name. See gsx --help"
 
 
 def parse_folder(arguments: list[str]) -> list[str]:
     """Refuse words that name another scene in `gsx FOLDER [KEY=VALUE ...]`."""
-    for word in arguments[1:]:
+    for word in split_flags(arguments[1:])[1]:
         if "=" not in word or word.startswith(("scene=", "scene.path=")):
             raise ConfigError(f"gsx {arguments[0]}: '{word}' does not go with the folder of a scene: leave it out")
     return arguments
@@ -137,7 +182,9 @@ def parse_eval(arguments: list[str]) -> argparse.Namespace:
     parser = Parser("eval", description)
     parser.add_argument("run", metavar="RUN|FILE", help=f"run folder or {SPLAT_FILE}")
     parser.add_overrides("settings to change")
-    return with_run_folder(parser, parser.parse_args(arguments))
+    options = with_run_folder(parser, parser.parse_args(arguments))
+    refuse_missing(options.run)
+    return options
 
 
 def parse_photographs(arguments: list[str]) -> argparse.Namespace:
@@ -178,6 +225,7 @@ def parse_render(arguments: list[str]) -> argparse.Namespace:
         raise InputError("gsx render: --movie FILE goes with --path JSON, --orbit FILE alone")
     if options.to and (options.movie or options.orbit):
         raise InputError("gsx render: --to FOLDER is for pictures; --movie and --orbit name their own FILE")
+    refuse_missing(options.target)
     return options
 
 
@@ -209,7 +257,7 @@ def parse_export(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--bake", type=positive(float), metavar="ZOOM", default=0.0, help=baked)
     axes = "axes of .spz: rub (SPZ standard) or rdf (as trained; SuperSplat and splat-transform)"
     parser.add_argument("--axes", choices=(SPECIFIED, TRAINED), default=SPECIFIED, help=axes)
-    versions = "version of .spz: 3 (most programs) or 4 (states its axes; needs gsx[spz])"
+    versions = "version of .spz: 3 (most programs) or 4 (states its axes; pip install 'gsx[spz]')"
     parser.add_argument("--spz-version", type=int, choices=SPZ_VERSIONS, default=SPZ_VERSIONS[0], help=versions)
     parser.add_axes("--from-axes")
     local = "for a scene far from (0, 0, 0): write positions relative to its origin; the file states it where it can"
@@ -219,6 +267,7 @@ def parse_export(arguments: list[str]) -> argparse.Namespace:
         refuse_beyond("gsx export --bake", options.bake, ZOOMS)
     if options.view and options.bake:
         raise InputError("gsx export: --view NAME writes one view, --bake ZOOM all of them: give one of the two")
+    refuse_missing(options.run)
     return options
 
 

@@ -22,7 +22,7 @@ gsx trains 3D Gaussian splats from photos, zooms in, and measures how much of th
 
   gsx                        train the built-in demo scene: start here, a few minutes on a laptop
   gsx FOLDER minutes=10      train from a folder: photos, COLMAP, transforms.json; or from a VIDEO
-  gsx view RUN               look around in the browser (needs gsx[viewer]); RUN is the folder of the report
+  gsx view RUN               look around in the browser (pip install 'gsx[viewer]'); RUN is the folder of the report
   gsx resume RUN             continue an interrupted run; iterations=N trains longer
   gsx eval RUN 'eval.zoom=[1,2,4]'  measure a run again, here also zoomed in
   gsx export RUN model.ply   write a splat file (.ply, .compressed.ply, .spz, .sog, .glb) or a web page (.html)
@@ -38,7 +38,8 @@ More commands; view, eval and export also take splat files of other programs:
 
 Every setting is a word KEY=VALUE:
   gsx scene=colmap scene.path=FOLDER scene.downscale=4 iterations=2000 'eval.zoom=[1,2,4]'
-  gsx minutes=N ...          plan size, steps and growth for N minutes; 10 for photos on a CPU, length=published for all
+  gsx minutes=N ...          plan size, steps and growth for N minutes; without it photos take 10 minutes on a CPU;
+                             length=published trains all 30,000 steps, as photos on a GPU do without it
   gsx --cfg job --resolve    print the settings instead of training
   gsx -m KEY=A,B ...         train once per combination; hydra/launcher=processes|slurm trains several at once
   gsx variant=octree_ub dataset=mipnerf360 dataset.scene=garden budget=paper|quick|smoke   train a published method

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gsx.builtin import plugins
+from gsx.cli.arguments import split_flags
 from gsx.cli.exit_codes import report_error
 from gsx.core.errors import ConfigError, GsxError, InputError, command
 from gsx.core.files import expand_home, read_json, write_json
@@ -19,7 +20,14 @@ from gsx.engine.cache import in_use
 from gsx.engine.processes import say, speaks
 from gsx.engine.signals import INTERRUPTED
 from gsx.experiments.minutes.clock import process_start
-from gsx.experiments.minutes.planned import planned, refuse_resumed, with_default_time, without_length
+from gsx.experiments.minutes.planned import (
+    log_untimed,
+    planned,
+    refuse_resumed,
+    untimed_because,
+    with_default_time,
+    without_length,
+)
 from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.claims import claimed
 from gsx.experiments.run_folder.files import read_run, reported, state_of
@@ -29,23 +37,29 @@ from gsx.experiments.runs.history import record_changes
 from gsx.experiments.runs.inspect import scene_loaders
 from gsx.experiments.runs.launched import ended_from_without, is_launched, waiting_for_all
 from gsx.experiments.runs.logs import set_up_logging
-from gsx.experiments.runs.multirun import check_overrides, hydra_main, job_overrides, job_place, launch
+from gsx.experiments.runs.multirun import check_overrides, job_overrides, job_place, launch, print_instead
 from gsx.experiments.runs.open import open_run, refuse_other, stamped_folder
 from gsx.experiments.runs.overrides import quoted, with_quoted_paths, word_of
 from gsx.experiments.runs.saved_settings import write_config
 from gsx.experiments.runs.settings import Settings, settings_from
 from gsx.experiments.runs.video import is_video, photos_of
-from gsx.experiments.tables.sweep import is_table, run_table
+from gsx.experiments.tables.sweep import is_table, run_table, with_plus
 
 logger = logging.getLogger("gsx.cli")
 
+MULTIRUN = {"-m", "--multirun"}
+"""Flags that train several runs."""
 
-def train(words: list[str]) -> int:
-    """Train one run, several (`-m`) or a table, or let Hydra print something, by the words of the command line."""
-    words = without_length(with_default_time(words) if trains_photos(words) else words)
-    several = bool({"-m", "--multirun"} & set(words))
-    if several:
-        return train_several(words)
+
+def train(words: list[str], of_folder: bool = False) -> int:
+    """Train one run, several (`-m`) or a table, or let Hydra print something, by the words of the command line.
+
+    of_folder: the command names a folder or a video, whose run on a CPU has a default length, as that of photos.
+    """
+    because = untimed_because(words) if of_folder or of_photos(words) else ""
+    words = with_plus(without_length(with_default_time(words) if trains_photos(words) else words))
+    if MULTIRUN & set(words):
+        return train_several(words, because)
     if any(word.startswith("-") for word in words):
         return print_by_hydra(words)
     if is_table(words):
@@ -53,14 +67,21 @@ def train(words: list[str]) -> int:
     folders: list[Path] = []
     with in_use():
         settings = planned(compose(words, loaded := plugins()), words, loaded, process_start())
+        log_untimed(because, f"{settings.general.iterations:,} steps")
         code = job.train(settings, loaded, folders)
     log_time(settings, code, time.monotonic() - process_start())
     return print_report(code, folders[0])
 
 
+def of_photos(words: Sequence[str]) -> bool:
+    """Return True for words that train on photos, one run or several."""
+    flags = {word for word in words if word.startswith("-")}
+    return "scene=photos" in words and flags <= MULTIRUN and not is_table(words)
+
+
 def trains_photos(words: Sequence[str]) -> bool:
     """Return True for words that train one run on photos."""
-    return "scene=photos" in words and not any(word.startswith("-") for word in words) and not is_table(words)
+    return of_photos(words) and not MULTIRUN & set(words)
 
 
 def log_time(settings: Settings, code: int, seconds: float) -> None:
@@ -92,15 +113,19 @@ def print_by_hydra(words: list[str]) -> int:
     """Print the configuration, completion or Hydra's help by Hydra's command line."""
     try:
         with redirect_stdout(StringIO()) as text:  # Hydra shows a traceback where it cannot write
-            hydra_main(with_quoted_paths(words), plugins(), sweep_job)
+            print_instead(*split_flags(words), plugins(), sweep_job)
     finally:  # it may end the program
         sys.stdout.write(text.getvalue())
     return 0
 
 
-def train_several(words: list[str]) -> int:
-    """Train one run per combination by Hydra's launcher; print one report over all. Return the worst exit code."""
+def train_several(words: list[str], because: str) -> int:
+    """Train one run per combination by Hydra's launcher; print one report over all. Return the worst exit code.
+
+    because: reason for which photos train without the default minutes; empty: there are no photos.
+    """
     refuse_for_sweeps(words)
+    log_untimed(because, "each run trains all its steps")
     overrides, loaded = with_quoted_paths([word for word in words if not word.startswith("-")]), plugins()
     output, of_launcher = check_overrides(overrides, loaded)
     sweep, code = stamped_folder(output / "sweeps"), 0
@@ -120,7 +145,7 @@ def refuse_for_sweeps(words: list[str]) -> None:
     if is_table(words):
         raise ConfigError("a table already trains several runs: leave out -m; launchers work without it")
     for word in words:
-        if word.startswith("-") and word not in ("-m", "--multirun"):
+        if word.startswith("-") and word not in MULTIRUN:
             raise ConfigError(f"-m trains several runs, {word} trains none: leave one of them out")
         if word.lstrip("+").startswith("hydra.sweep.dir="):
             raise ConfigError(f"'{word}': a multirun's record goes below output/sweeps; give output=FOLDER")
@@ -191,9 +216,10 @@ def train_folder(arguments: list[str]) -> int:
     scene = words[0].partition("=")[2]
     kind = "a video" if path.is_file() and scene == "photos" else f"read as scene={scene}"
     logger.info("%s is %s", path, kind)
-    words = with_default_time([*words, *overrides])
+    words = [*words, *overrides]
+    words = words if MULTIRUN & set(words) else with_default_time(words)
     logger.info("%s", command(*words))
-    return train(words)
+    return train(words, of_folder=True)
 
 
 def scene_words(path: Path, overrides: Sequence[str], loaded: Plugins) -> list[str]:

@@ -1,10 +1,11 @@
 """Suffixes of splat files."""
 
+import difflib
 import json
 from contextlib import suppress
 from pathlib import Path
 
-from gsx.core.errors import InputError
+from gsx.core.errors import CLOSE, InputError
 
 WRITTEN = (".compressed.ply", ".ply", ".spz", ".sog", ".glb")
 """Suffixes that gsx writes, the longer of two matches first."""
@@ -49,5 +50,8 @@ def is_sog_folder(path: Path) -> bool:
 def refuse_suffix(path: Path, others: tuple[str, ...] = ()) -> None:
     """Raises InputError for a suffix that gsx does not write; `others`: suffixes apart from splat files."""
     if path.name.lower() == META or suffix_of(path) not in WRITTEN:
-        better = path.parent / f"{path.stem or 'model'}{STANDARD}"
-        raise InputError(f"{path} is not written: gsx writes {', '.join((*WRITTEN, *others))} alone, name it {better}")
+        known = (*WRITTEN, *others)
+        near = difflib.get_close_matches(path.suffix.lower(), known, n=1, cutoff=CLOSE)
+        better = path.with_name(f"{path.stem or 'model'}{near[0] if near else STANDARD}")
+        remedy = f". Did you mean {better}?" if near else f", name it {better}"
+        raise InputError(f"{path} is not written: gsx writes {', '.join(known)} alone{remedy}")

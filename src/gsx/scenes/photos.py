@@ -118,12 +118,14 @@ def find_photos(path: Path) -> tuple[Path, list[str]]:
     folder = path / IMAGES if not photos_in(path, "*") and (path / IMAGES).is_dir() else path
     names = photos_in(folder, "*") or photos_in(folder, "**/*")
     if len(names) < MIN_PHOTOS:
-        found = ", ".join(sorted({file.suffix for file in folder.rglob("*") if file.is_file()})) or "nothing"
+        others = sorted({file.suffix for file in folder.rglob("*") if file.is_file()} - {*PHOTO_SUFFIXES, ""})
+        convert = f", or convert others to JPEG (found: {', '.join(others)})" if others else ""
+        count = f"{len(names)} photo{'s' * (len(names) != 1)}"
         if foreign := foreign_sentences(folder):
             raise InputError(f"{folder} holds {len(names)} photos in other formats, and {' '.join(foreign)}")
         raise InputError(
-            f"{folder} holds {len(names)} photos ({', '.join(PHOTO_SUFFIXES)}; found: {found}), but reconstruction "
-            f"needs at least {MIN_PHOTOS}: name another folder or convert the photos to JPEG."
+            f"{folder} holds {count} ({', '.join(PHOTO_SUFFIXES)}), but reconstruction needs at least {MIN_PHOTOS}: "
+            f"add photos, 30 to 200 of a scene{convert}."
         )
     return folder, names
 

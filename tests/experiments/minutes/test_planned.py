@@ -14,7 +14,14 @@ from gsx.core.errors import CompilerError, ConfigError, InputError
 from gsx.core.training.run import Run
 from gsx.experiments.minutes import probe
 from gsx.experiments.minutes.options import plan_options
-from gsx.experiments.minutes.planned import keys_of, planned, refuse_resumed, with_default_time, without_length
+from gsx.experiments.minutes.planned import (
+    keys_of,
+    planned,
+    refuse_resumed,
+    untimed_because,
+    with_default_time,
+    without_length,
+)
 from gsx.experiments.minutes.probe import measure, quiet
 from gsx.experiments.runs import job
 from gsx.experiments.runs.compose import compose
@@ -71,9 +78,32 @@ def test_what_minutes_cannot_be_combined_with(more: list[str], message: str) -> 
         planned(compose(words, loaded), words, loaded)
 
 
+@pytest.mark.parametrize(
+    ("more", "because"),
+    [
+        ("preset=zoom_prior", "preset=zoom_prior"),
+        ("augmenter=[upscale] regenerator/upscale=span", "augmenter=[upscale]"),
+        ("-m seed=0,1", "-m"),
+        ("preset=zoom minutes=3", ""),
+        ("variant=3dgs length=published", ""),
+        ("backbone=gs3d", ""),
+    ],
+)
+def test_reasons_for_no_default_minutes(more: str, because: str) -> None:
+    words = ["scene=photos", "device=cpu", *more.split()]
+    assert untimed_because(words) == because
+    assert because in ("", "-m") or with_default_time(words) == words
+
+
+def test_no_time_is_refused_at_once() -> None:
+    words, loaded = [*WORDS, "minutes=0.01"], plugins()
+    with pytest.raises(ConfigError, match=r"minutes=0\.01 leaves nothing after start-up .* give at least minutes=1$"):
+        planned(compose(words, loaded), words, loaded)
+
+
 def test_too_few_seconds_are_refused(tmp_path: Path) -> None:
     words, loaded = [*WORDS, "seconds=0.5", f"folder={tmp_path / 'run'}"], plugins()
-    with pytest.raises(ConfigError, match="give more minutes"):
+    with pytest.raises(ConfigError, match=r"seconds=0\.5 leaves nothing after start-up \(\d+ s here\) .* seconds=60$"):
         planned(compose(words, loaded), words, loaded)
     assert not (tmp_path / "run").exists()
 

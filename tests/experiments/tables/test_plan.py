@@ -20,6 +20,7 @@ from gsx.experiments.run_folder.run_key import (
     scene_stamp,
 )
 from gsx.experiments.runs.compose import Compositions, compose
+from gsx.experiments.runs.logs import set_up_logging
 from gsx.experiments.runs.saved_settings import write_config
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.tables.plan import Cell, Experiment, cells_of, plan_lines, planned
@@ -241,9 +242,11 @@ def test_mistakes_are_named_before_anything_runs(words: list[str], message: str,
 
 
 def test_words_of_a_component_go_to_the_rows_that_have_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["+experiment=table_frameworks", "dataset=demo", f"output={tmp_path}", "experiment.dry=true",
+    words = ["experiment=table_frameworks", "dataset=demo", f"output={tmp_path}", "experiment.dry=true",
              "regenerator.upscale.model=models/x2", "experiment.only=[3D-GS,3D-GS-UP]"]  # fmt: skip
+    set_up_logging()
     commands, _ = run_table(words, plugins(), lambda config: None)
+    assert capsys.readouterr().err.startswith("composing the runs of +experiment=table_frameworks ...\n")
     control, upscaled = commands.splitlines()
     assert "variant=3d_gs " in control
     assert "model=" not in control

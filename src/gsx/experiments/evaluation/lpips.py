@@ -5,7 +5,6 @@ linear layers of the lpips package (`vgg.pth`, `alex.pth`). 3D-GS (metrics.py) f
 [-1, 1]: `input_range` selects.
 """
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -16,8 +15,6 @@ from torch import Tensor, nn
 from gsx.core.errors import InputError
 from gsx.experiments.evaluation.feature_distance import FeatureDistance
 from gsx.experiments.evaluation.weight_files import read_weights
-
-logger = logging.getLogger(__name__)
 
 Layer: TypeAlias = tuple[int, int, int, int]
 """Convolution: channels, kernel, stride, padding; a ReLU follows."""
@@ -128,7 +125,6 @@ def load_lpips(options: LpipsOptions) -> Lpips | None:
         missing = "head" if options.trunk else "trunk"
         raise InputError(f"metrics.lpips.{missing} is missing: give both weights files, or neither")
     if not options.trunk:
-        logger.info("LPIPS is not measured without weights: metrics.lpips.trunk=FILE metrics.lpips.head=FILE")
         return None
     trunk, trunk_hash = read_weights(options.trunk, "metrics.lpips.trunk")
     head, head_hash = read_weights(options.head, "metrics.lpips.head")

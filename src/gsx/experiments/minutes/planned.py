@@ -58,6 +58,25 @@ def with_default_time(words: Sequence[str]) -> list[str]:
     return [*words, f"minutes={plan_options().default:g}"]
 
 
+def untimed_because(words: Sequence[str]) -> str:
+    """Returns the words that keep the default minutes from photos on a CPU; empty: none do, or they choose a length."""
+    if keys_of(words) & {*TIMES, *LENGTHS} or not on_cpu(words):
+        return ""
+    several = [word for word in words if word in ("-m", "--multirun")]
+    return " ".join([*several, *(word for word in words if keys_of([word]) & {*OWN_LENGTH}), *torchrun()])
+
+
+def torchrun() -> list[str]:
+    """Returns the word for several processes, if there are."""
+    return ["torchrun"] if processes() > 1 else []
+
+
+def log_untimed(because: str, length: str) -> None:
+    """Logs why a run has no default minutes, and its length instead; `because`: empty if it has, or chooses one."""
+    if because:
+        logger.info("no minutes=%g because of %s: %s", plan_options().default, because, length)
+
+
 def without_length(words: Sequence[str]) -> list[str]:
     """Returns words without PUBLISHED: nothing else is the length of the published run."""
     return [word for word in words if word.replace("'", "") != PUBLISHED]
@@ -87,6 +106,7 @@ def planned(settings: Settings, words: Sequence[str], loaded: Plugins, started: 
         return settings
     started, fixed, options = time.monotonic() if started is None else started, keys_of(words), plan_options()
     refuse(settings, fixed)
+    refuse_no_time(settings, limit, time.monotonic() - started, options)
     refuse_early(settings)
     changes = schedule_of(settings, fixed, options) | capacity_of(flattened(settings.resolved), fixed, MANY)
     with compiling_before(overridden(settings, changes | {"iterations": LENGTH}, loaded)):
@@ -138,6 +158,18 @@ def refuse(settings: Settings, fixed: frozenset[str]) -> None:
         raise ConfigError(f"{name}=N plans models that begin with the scene: give iterations=N with init=FILE")
     if processes() > 1:
         raise ConfigError(f"{name}=N plans for one process: call gsx without torchrun, or give iterations=N")
+
+
+def refuse_no_time(settings: Settings, limit: float, used: float, options: PlanOptions) -> None:
+    """Raises ConfigError if nothing of the time is left for training after `used` seconds and the report."""
+    if limit - used > options.report:
+        return
+    name, value = ("minutes", limit / 60) if settings.general.minutes else ("seconds", limit)
+    least = math.ceil((used + options.report) / 60)
+    raise ConfigError(
+        f"{name}={value:g} leaves nothing after start-up ({used:.0f} s here) and report: give at least "
+        f"{name}={least if name == 'minutes' else 60 * least}"
+    )
 
 
 def task_of(

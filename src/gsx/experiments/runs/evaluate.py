@@ -43,6 +43,8 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     pictures = Pictures(run.folder / "renders", run.step)
     if run.scene.test:
         logger.info("evaluating %d test views at zoom %s", len(run.scene.test), options.zoom)
+        if evaluator.lpips is None:
+            logger.info("LPIPS is not measured without weights: metrics.lpips.trunk=FILE metrics.lpips.head=FILE")
     evaluation = evaluator.evaluate(pictures, Countdown("evaluating", evaluator.work()).advance)
     if run.scene.test:
         add_depth_and_flight(run, pictures, options)

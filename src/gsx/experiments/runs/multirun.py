@@ -3,19 +3,21 @@
 import math
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from gsx.core.errors import ConfigError, GsxError, first_line
 from gsx.core.plugins import Plugins
 from gsx.experiments.runs import config_files
 from gsx.experiments.runs.compose import MODULE, compose_raw, hydra_session, known_groups, version_base
 from gsx.experiments.runs.launched import waiting_for_all
-from gsx.experiments.runs.overrides import parse_overrides, quoted, refuse_absent_slurm
+from gsx.experiments.runs.overrides import parse_overrides, quoted, refuse_absent_slurm, with_quoted_paths
 from gsx.experiments.runs.settings import settings_from
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -65,10 +67,10 @@ def check_overrides(overrides: Sequence[str], plugins: Plugins) -> tuple[Path, l
         refuse_one_folder(parsed)
         words = [words_of(one, one.key_or_group in groups) for one in parsed]
         first = [values[0] for values in words]
-        output = Path(settings_from(compose_raw(first), plugins).general.output)
+        output = Path(settings_from(compose_raw(first, plugins.registry), plugins).general.output)
         for place, values in enumerate(words):
             for other in values[1:]:
-                compose_raw([*first[:place], other, *first[place + 1 :]])
+                compose_raw([*first[:place], other, *first[place + 1 :]], plugins.registry)
         return output, launcher_for(math.prod(size_of_sweep(one) for one in parsed), first)
 
 
@@ -125,15 +127,40 @@ def launch(arguments: Sequence[str], plugins: Plugins, job: Job) -> None:
     Raises:
         ConfigError: the launcher failed. Errors of gsx and of the file system stay as they are.
     """
-    before = os.environ.get(FULL_ERROR)
-    os.environ[FULL_ERROR] = "1"  # otherwise Hydra prints a traceback and ends the program
     try:
-        hydra_main(arguments, plugins, job)
+        with full_errors():
+            hydra_main(arguments, plugins, job)
     except (GsxError, OSError):
         raise
     except Exception as error:
         remedy = "correct its settings, or run one after the other here with hydra/launcher=basic"
         raise ConfigError(f"the launcher failed ({type(error).__name__}: {first_line(error)}): {remedy}") from error
+
+
+def print_instead(flags: Sequence[str], overrides: Sequence[str], plugins: Plugins, job: Job) -> None:
+    """Let Hydra print what the flags name.
+
+    Raises:
+        ConfigError: the overrides cannot be composed.
+    """
+    from hydra.errors import HydraException
+
+    try:
+        with full_errors():
+            hydra_main([*flags, *with_quoted_paths(overrides)], plugins, job)
+    except (HydraException, OmegaConfBaseException) as error:
+        with hydra_session(plugins):
+            compose_raw(overrides, plugins.registry)  # its errors name remedies
+        raise ConfigError(f"Hydra failed ({first_line(error)}): correct the words after gsx") from error
+
+
+@contextmanager
+def full_errors() -> Iterator[None]:
+    """Make Hydra raise its errors: otherwise it prints a traceback and ends the program."""
+    before = os.environ.get(FULL_ERROR)
+    os.environ[FULL_ERROR] = "1"
+    try:
+        yield
     finally:
         os.environ.pop(FULL_ERROR, None)
         os.environ |= {} if before is None else {FULL_ERROR: before}

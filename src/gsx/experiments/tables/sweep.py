@@ -56,6 +56,11 @@ def is_table(overrides: Sequence[str]) -> bool:
     return any(word.lstrip("+").startswith("experiment=") for word in overrides)
 
 
+def with_plus(words: Sequence[str]) -> list[str]:
+    """Returns words with `+` before the choice of a table, which the configuration has no default of."""
+    return [f"+{word.lstrip('+')}" if is_table([word]) else word for word in words]
+
+
 def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], Any]) -> tuple[str, int]:
     """Runs what is missing of a table; returns its text and the exit code: 2 if figures are missing.
 
@@ -64,7 +69,8 @@ def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], A
     Raises:
         ConfigError: an experiment, dataset or override is wrong; nothing was run.
     """
-    overrides = [f"+{word.lstrip('+')}" if is_table([word]) else word for word in overrides]
+    overrides = with_plus(overrides)
+    logger.info("composing the runs of %s ...", " ".join(word for word in overrides if is_table([word])))
     common = [word for word in overrides if key_of(word) not in OWN or is_below_dataset(word)]
     launching = [word for word in overrides if key_of(word) == "hydra"]
     with in_use(), Compositions(plugins) as compositions:  # its runs begin with states of each other
