@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 from tiny import LIGHT, tiny_run
 
 from gsx.builtin import plugins
@@ -40,8 +41,9 @@ def test_it_is_opened_rendered_exported_and_evaluated(orphan: Path, tmp_path: Pa
 
 def test_an_absent_competitor_is_needed_to_evaluate_alone(orphan: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(orphan, tmp_path / "run"))
-    config = (folder / "config.yaml").read_text()
-    (folder / "config.yaml").write_text(config.replace("competitor: null", "competitor: {name: doubled}"))
+    config = OmegaConf.load(folder / "config.yaml")
+    config.eval.competitor = {"name": "doubled"}
+    OmegaConf.save(config, folder / "config.yaml")
     assert open_run(folder, plugins())[1].competitor is None
     with pytest.raises(ConfigError, match=r"^eval.competitor is 'doubled', .*, or leave it out by "):
         open_run(folder, plugins(), evaluating=True)
