@@ -16,13 +16,14 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.resize import to_uint8
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.experiments.evaluation.chosen_views import distinct
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.run_folder.files import read_run, state_of
-from gsx.experiments.runs.photo_check import different, findings_of, summary_lines
+from gsx.experiments.runs.photo_check import findings_of, summary_lines
 from gsx.modules.alignment import Motion, move_camera, rotation_by
 from gsx.modules.image_shift import estimate_shift
 
@@ -261,7 +262,7 @@ def test_a_damaged_index_is_told_and_makes_no_run_unfinished(run: Run) -> None:
 
 def test_views_that_several_steps_show_are_looked_at_once(run: Run) -> None:
     views = run.scene.train
-    assert different([*views, *views]) == list(views)
+    assert distinct([*views, *views]) == list(views)
 
 
 def test_lines_on_the_terminal() -> None:

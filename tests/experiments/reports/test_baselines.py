@@ -26,6 +26,7 @@ def run(
         pictures={},
         pseudo={},
         photographs={},
+        retakes={},
         status={},
         problems={},
     )

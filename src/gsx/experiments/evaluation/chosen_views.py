@@ -1,4 +1,4 @@
-"""Choice of views: some of all, evenly spread, and the neighbour of one."""
+"""Choice of views: some of all, evenly spread, each once, and the neighbour of one."""
 
 import math
 from collections.abc import Sequence
@@ -7,6 +7,7 @@ from typing import TypeVar
 import torch
 
 from gsx.core.data.camera import Camera
+from gsx.core.data.scene import View
 
 T = TypeVar("T")
 
@@ -18,6 +19,11 @@ def evenly(items: Sequence[T], count: int) -> list[T]:
     """Returns up to `count` items, the middles of as many equal parts."""
     count = min(count, len(items))
     return [items[(2 * part + 1) * len(items) // (2 * count)] for part in range(count)]
+
+
+def distinct(views: Sequence[View]) -> list[View]:
+    """Returns each view once, by name: some protocols repeat views."""
+    return list({view.name: view for view in views}.values())
 
 
 def neighbour(camera: Camera, others: Sequence[Camera]) -> int | None:

@@ -23,6 +23,11 @@ def signed(value: Any, digits: int = 2) -> str:
     return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}") if is_number(value) else NONE
 
 
+def share(value: Any) -> str:
+    """Formats a share of 1 in per cent, or n/a."""
+    return f"{100 * value:.0f} %" if is_number(value) else NONE
+
+
 def duration(seconds: Any) -> str:
     """Formats a time: 42 s, 5 min 05 s, 42 min, 3 h 20 min, or n/a."""
     if not is_number(seconds):
@@ -72,7 +77,7 @@ def template(name: str) -> jinja2.Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    filters = (address, fixed, signed, duration, compact, plain)
+    filters = (address, fixed, signed, share, duration, compact, plain)
     environment.filters |= {function.__name__: function for function in filters}
     environment.tests["figure"] = is_number
     return environment.get_template(name)

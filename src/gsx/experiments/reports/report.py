@@ -105,6 +105,7 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "evaluation": evaluation,
         "protocol": part(evaluation, "protocol"),
         "groups": part(evaluation, "groups"),
+        **coverage_context(evaluation),
         "zoom_groups": zoom_groups(zoom),
         "scene": part(run.environment, "scene"),
         "plan": part(run.environment, "plan"),
@@ -131,6 +132,18 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "percent": lambda step: round(100 * min(max(float(step), 0), run.iterations) / run.iterations, 2),
         "ramp": ", ".join(f"rgb{colour} {place:.0%}" for place, colour in ERROR_COLOURS),
         "environment_text": json.dumps(run.environment, indent=2, ensure_ascii=False) if run.environment else "",
+    }
+
+
+def coverage_context(evaluation: dict[str, Any]) -> dict[str, Any]:
+    """Returns the coverage of views, its classes of test views and of training views; empty where unknown."""
+    coverage = part(evaluation, "coverage")
+    classes, training = part(coverage, "classes"), part(coverage, "training")
+    return {
+        "coverage": coverage,
+        "classes": classes if any(one["views"] for one in classes.values()) else {},
+        "training": training,
+        "training_classes": part(training, "classes"),
     }
 
 

@@ -30,6 +30,8 @@ LOST = ("metrics.jsonl", "checkpoints/")
 """Files of a finished run that cannot be made again."""
 PHOTO_FINDINGS = "photographs/index.json"
 """Optional: written by `gsx photographs`."""
+RETAKES = "retakes/index.json"
+"""Optional: written by evaluations of scenes of photos."""
 STATES = ("ok", "running", "interrupted", "failed", "corrupted")
 
 
@@ -50,6 +52,8 @@ class RunFiles:
     """Content of pseudo/index.json."""
     photographs: dict[str, Any]
     """Content of photographs/index.json."""
+    retakes: dict[str, Any]
+    """Content of retakes/index.json."""
     status: dict[str, Any]
     problems: dict[str, str]
     """Errors in words, by file."""
@@ -95,7 +99,9 @@ class RunFiles:
     @cached_property
     def damaged(self) -> dict[str, str]:
         """Return the problem of each damaged file: by content for those that are read, by size for the others."""
-        found = {name: problem for name, problem in self.problems.items() if name not in (*LOST, PHOTO_FINDINGS)}
+        found = {
+            name: problem for name, problem in self.problems.items() if name not in (*LOST, PHOTO_FINDINGS, RETAKES)
+        }
         if self.iterations > 0 and not self.lines and "metrics.jsonl" in self.first_files:
             found["metrics.jsonl"] = "metrics.jsonl holds no line of the run"
         found[SPLATS] = splats_problem(self.folder / SPLATS)
@@ -180,6 +186,7 @@ def read_run(folder: Path) -> RunFiles:
         pictures=read("renders/index.json", shapes.DRAWN),
         pseudo=read("pseudo/index.json", shapes.PSEUDO_VIEWS),
         photographs=read(PHOTO_FINDINGS, shapes.PHOTOGRAPHS),
+        retakes=read(RETAKES, shapes.RETAKES),
         status=read("status.json", shapes.STATUS),
         problems=problems,
     )

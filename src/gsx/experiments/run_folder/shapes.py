@@ -64,6 +64,13 @@ EVALUATION: Shape = {
     "left_out?": is_number_or_null,
     "perceptual?": {str: is_number_or_null},
     "remarks?": [str],
+    "coverage?": {
+        "unavailable?": str,
+        "least_views?": is_number,
+        "share?": is_number_or_null,
+        "classes?": {str: {"from": is_number, "views": is_number, "psnr": is_number_or_null}},
+        "training?": {"share": is_number_or_null, "classes": {str: is_number}},
+    },
 }
 ENVIRONMENT: Shape = {"scene?": {"notes?": list}, "history?": [{"changed?": {str: (object, object)}}]}
 DRAWN: Shape = {
@@ -73,6 +80,14 @@ DRAWN: Shape = {
 }
 PSEUDO_VIEWS: Shape = {"views?": [dict]}
 PHOTOGRAPHS: Shape = {"step?": is_number_or_null, "views": [{"name": str, "remarks": list, "files?": PICTURES}]}
+RETAKES: Shape = {
+    "step?": is_number_or_null,
+    "facts": str,
+    "gaps": str,
+    "places": [{"view": str, "words": str, "reason": str, "files": PICTURES}],
+    "photos": [{"name": str, "remarks": [str], "files?": PICTURES}],
+    "unplaced": [{"name": str, "where": str, "files?": PICTURES}],
+}
 STATUS: Shape = {"step?": is_number_or_null}
 COMPACT: Shape = {"from": str}
 

@@ -182,12 +182,15 @@ def ring(views: Sequence[View]) -> Ring | None:
 
 def ring_line(views: Sequence[View], around: Ring) -> str:
     """Report the range of directions of the cameras, and its gaps."""
+    gaps = ring_gaps(views, around)
+    line = f"around    cameras look at one place, from {math.ceil(360 - max(around.gaps))} of 360 degrees"
+    return f"{line}; gaps of {gaps}; take photos there" if gaps else line
+
+
+def ring_gaps(views: Sequence[View], around: Ring) -> str:
+    """Return up to three gaps between cameras around a place, in degrees; empty without any."""
     open_side, *others = sorted(range(len(around.gaps)), key=lambda i: -around.gaps[i])
     usual, closed = median(around.gaps), around.gaps[open_side] < 90
     wide = [i for i in ([open_side] if closed else []) + others if around.gaps[i] > max(GAP, 3 * usual)]
-    line = f"around    cameras look at one place, from {math.ceil(360 - around.gaps[open_side])} of 360 degrees"
-    if not wide:
-        return line
     names = [views[i].name for i in around.order]
-    places = ", ".join(f"{around.gaps[i]:.0f} between {names[i]} and {names[(i + 1) % len(names)]}" for i in wide[:3])
-    return f"{line}; gaps of {places}; take photos there"
+    return ", ".join(f"{around.gaps[i]:.0f} between {names[i]} and {names[(i + 1) % len(names)]}" for i in wide[:3])

@@ -18,6 +18,7 @@ from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.perceptual import COMPARED
 from gsx.experiments.evaluation.remarks import measures_nothing, remarks_of
+from gsx.experiments.evaluation.view_coverage import SceneCoverage, coverage_lines, coverage_of
 from gsx.experiments.reports.pictures import Pictures
 from gsx.experiments.run_folder.files import (
     DETAIL_OF,
@@ -31,6 +32,7 @@ from gsx.experiments.run_folder.files import (
 from gsx.experiments.run_folder.run_key import evaluation_settings
 from gsx.experiments.runs.flight import add_depth, add_flight
 from gsx.experiments.runs.progress import Countdown
+from gsx.experiments.runs.retakes import takes_photos, write_retakes
 from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -50,6 +52,7 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
         add_depth_and_flight(run, pictures, options)
     pictures.write_index()
     write_pseudo_pictures(run, options)
+    coverage = coverage_or_none(run, options, evaluation)
     evaluation |= {
         "evaluate_seconds": time.perf_counter() - started,
         "settings": evaluation_settings(settings.resolved),
@@ -61,7 +64,21 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     write_json(run.folder / "evaluation.json", evaluation)
     for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy), *advice(evaluation, settings)]:
         logger.info("%s", line)
+    if coverage is not None and takes_photos(run):
+        for line in write_retakes(run, coverage, options.tile_pixels):
+            logger.info("%s", line)
     return evaluation
+
+
+def coverage_or_none(run: Run, options: EvalOptions, evaluation: dict[str, Any]) -> SceneCoverage | None:
+    """Add the coverage of views to an evaluation, or the reason why it is unknown (then return None)."""
+    try:
+        coverage = coverage_of(run, options)
+    except (RuntimeError, TooManyPairs, MemoryError) as error:
+        evaluation["coverage"] = {"unavailable": first_line(error)}
+        return None
+    evaluation |= coverage.figures(evaluation["views"], options.right_halves)
+    return coverage
 
 
 def competitor_of(run: Run, settings: Settings) -> Competitor | None:
@@ -103,12 +120,12 @@ def summary(evaluation: dict[str, Any]) -> list[str]:
         f"peak memory {memory}"
     )
     if measures_nothing(e):
-        return [cost, *remarks_of(e)]
+        return [cost, *coverage_lines(e), *remarks_of(e)]
     lpips = "n/a (no weights)" if e["lpips"] is None else f"{e['lpips']:.4f}"
     quality = f"held-out PSNR {e['psnr']:.2f} dB, SSIM ({e['protocol']['ssim']}) {e['ssim']:.4f}, LPIPS {lpips}"
     quality += "".join(f", {name} {perceptual_figure(e, name):.4f}" for name in perceptual_names(e))
     lines = [line for factor, result in e["zoom"].items() for line in zoom_lines(factor, result, upscaler_of(e))]
-    return [quality, cost, *lines, *remarks_of(e)]
+    return [quality, cost, *coverage_lines(e), *lines, *remarks_of(e)]
 
 
 def remedies(run: Run, evaluation: dict[str, Any], remedy: str) -> list[str]:

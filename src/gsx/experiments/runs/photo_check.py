@@ -19,6 +19,7 @@ from gsx.core.shapes import Float
 from gsx.core.training.module import TrainingModule
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
+from gsx.experiments.evaluation.chosen_views import distinct
 from gsx.experiments.evaluation.photographs import Finding, concentrated, gains_of, remarks_on
 from gsx.experiments.reports.pictures import Pictures, file_names, forget
 from gsx.experiments.reports.report import write_report
@@ -46,7 +47,7 @@ def check_photos(folder: Path, plugins: Plugins, worst: int, overrides: Sequence
 
 def findings_of(run: Run, pixels: int) -> list[Finding]:
     """Return findings on every training photo, worst first."""
-    views = different(run.train_views)
+    views = distinct(run.train_views)
     progress, known = Countdown("checking photos", len(views)), sharpness_of(run.scene.train)
     findings = []
     for view in views:
@@ -63,11 +64,6 @@ def findings_of(run: Run, pixels: int) -> list[Finding]:
 def is_active(module: TrainingModule | None) -> bool:
     """Return True for a module that corrects photos now."""
     return isinstance(module, Correction) and module.active
-
-
-def different(views: Sequence[View]) -> list[View]:
-    """Return each view once: some protocols repeat views."""
-    return list({view.name: view for view in views}.values())
 
 
 def sharpness_of(views: Sequence[View]) -> dict[str, float]:
