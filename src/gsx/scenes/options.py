@@ -45,6 +45,8 @@ class SceneOptions:
     """Factor of all positions; published constants (near plane 0.2, limits of scales) expect scenes of a few units."""
     fill: Annotated[int, Range(0, 10**8)] = 0
     """Points that are added where training views have none (gsx.scenes.filling)."""
+    stereo: Annotated[int, Range(0, 10**8)] = 0
+    """Points that are measured by stereo and added (gsx.scenes.stereo)."""
     disturb: Annotated[dict[str, float], Range(0, 64)] = field(
         default_factory=lambda: {"exposure": 0.0, "shade": 0.0, "pose": 0.0, "blur": 0.0, "covered": 0.0, "some": 1.0}
     )

@@ -20,6 +20,7 @@ from gsx.formats.origin import Origin
 from gsx.scenes.filling import fill_gaps
 from gsx.scenes.origin import around_origin, origin_of
 from gsx.scenes.posed import SAME_PLACE
+from gsx.scenes.stereo import add_stereo_points
 
 HIDDEN_SHARE, LARGEST_EXTENT = 0.02, 1e3
 """Largest share of points hidden by near planes, and extent, of units that 3D-GS expects."""
@@ -52,7 +53,11 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
     if count := getattr(options, "fill", 0):
         generator = torch.Generator().manual_seed(derived_seed("fill", settings.general.seed))
         scene = fill_gaps(scene, count, generator)
-    return degrade(scene, getattr(options, "disturb", {}))
+    scene = degrade(scene, getattr(options, "disturb", {}))
+    if (count := getattr(options, "stereo", 0)) and len(scene.points):
+        generator = torch.Generator().manual_seed(derived_seed("stereo", settings.general.seed))
+        scene = add_stereo_points(scene, count, generator)
+    return scene
 
 
 def refuse_absent_scene(settings: Settings) -> None:
