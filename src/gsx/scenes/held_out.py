@@ -156,7 +156,7 @@ def widened(camera: Any, models: Mapping[str, str]) -> Any:
     wider = pycolmap.Camera.create_from_model_name(
         camera.camera_id, models[camera.model_name], focal, camera.width, camera.height
     )
-    params = np.array(wider.params)
+    params: Any = np.array(wider.params)
     params[wider.principal_point_idxs()] = centre_of(camera)
     if len(wider.focal_length_idxs()) == len(camera.focal_length_idxs()):
         params[wider.focal_length_idxs()] = camera.params[camera.focal_length_idxs()]

@@ -139,3 +139,36 @@ def test_zooms_without_photos_cost_nothing() -> None:
     """At 1/4 size, zooms 1, 2 and 4 draw 1 + 4 + 16 x1 pictures, at 1/2 size 1 + 4, at full size 1."""
     task = task_of(600.0, words=("eval.zoom=[1,2,4]",))
     assert [drawn_pixels(task, downscale) for downscale in (4, 2, 1)] == [21, 5, 1]
+
+
+# -- points by stereo --------------------------------------------------------------------------------------------------
+
+
+def with_points(*fixed: str, **changes: Any) -> Task:
+    """A run on a scene whose photos take a tenth of a second each."""
+    return task_of(600.0, *fixed, **{"stereo": 0.1, **changes})
+
+
+def on_anchors() -> Task:
+    return replace(with_points(), settings=composed("backbone=octree_scaffold"))
+
+
+def test_photos_begin_with_half_of_the_primitives() -> None:
+    task = with_points()
+    plan = plan_run(task)
+    assert changes_of(task, plan)["scene.stereo"] == round(0.5 * plan.primitives) - MEASURED.primitives
+    assert plan.other == pytest.approx(plan_run(with_points(stereo=0.2)).other - 4.0, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    "task",
+    [with_points("scene.stereo"), with_points(stereo=0.0), on_anchors()],
+    ids=["chosen", "no points", "anchors"],
+)
+def test_other_runs_begin_without_stereo(task: Task) -> None:
+    assert "scene.stereo" not in changes_of(task, plan_run(task))
+
+
+def test_a_scene_with_enough_points_gets_no_others() -> None:
+    task = with_points(primitives=10**6)
+    assert changes_of(task, plan_run(task))["scene.stereo"] == 0

@@ -34,6 +34,8 @@ class Measurement:
     """Type of the device that was measured: cpu or cuda."""
     random: bool = False
     """True: the model began with random points, which cover many pixels."""
+    stereo: float = 0.0
+    """Seconds to measure the depths of a photo by stereo; 0: the scene has no points to search around."""
 
 
 @dataclass(frozen=True, kw_only=True)

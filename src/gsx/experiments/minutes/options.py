@@ -74,6 +74,8 @@ class PlanOptions:
     """Most primitives that growth adds per thousand steps."""
     events: int
     """Events of density control that a short run has at least."""
+    stereo: float
+    """Starting points by stereo, as a share of the primitives at the end of growth."""
     report: float
     """Seconds of export and report after evaluation."""
     probe: ProbeOptions

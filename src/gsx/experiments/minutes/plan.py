@@ -13,7 +13,7 @@ from gsx.experiments.runs.settings import Settings
 
 SIZE, WIDTH = "scene.downscale", "scene.max_width"
 CAPACITY, BUDGET, MOST = "backbone.capacity", "backbone.budget.primitives", "backbone.max_primitives"
-PATH, PASSES = "rasterizer.path", "backbone.density.passes"
+PATH, PASSES, STEREO = "rasterizer.path", "backbone.density.passes", "scene.stereo"
 CHECKS, FINE_FROM = "training.test_points", "training.supersampling.start"
 EVERY = 100
 """Steps between events of density control in published runs (3D-GS)."""
@@ -152,7 +152,17 @@ def other_seconds(task: Task, downscale: int) -> float:
     checks = task.values[CHECKS] * min(task.tests, CHECKED) * measurement.check
     zooms = drawn_pixels(task, downscale) / drawn_pixels(task, measurement.downscale)
     drawn = larger * (task.tests * zooms * measurement.evaluate + checks)
-    return task.views * measurement.photo + drawn + task.options.report
+    stereo = measurement.stereo if with_stereo(task) else 0.0
+    return task.views * (measurement.photo + stereo) + drawn + task.options.report
+
+
+def with_stereo(task: Task) -> bool:
+    """Returns whether Gaussians begin with points by stereo: on photos with points, unless the user chooses.
+
+    Anchors begin without: nobody has measured them.
+    """
+    chosen = STEREO not in task.values or STEREO in task.fixed
+    return not chosen and task.measurement.stereo > 0 and rows_of(task) == 1
 
 
 def drawn_pixels(task: Task, downscale: int) -> float:
@@ -185,6 +195,7 @@ def growth_of(task: Task, downscale: int, steps: int) -> Growth:
     """Returns the rows of the model over the run."""
     first, options, values = task.measurement.primitives, task.options, task.values
     target = options.density * pixels_at(task, downscale) * math.sqrt(task.views) / rows_of(task)
+    first += stereo_points(task, target)
     last = min(target, first + options.most_growth * steps / 1000)
     if values.get(CAPACITY) == "budget" and CAPACITY in task.fixed:
         last = values[BUDGET]
@@ -192,6 +203,13 @@ def growth_of(task: Task, downscale: int, steps: int) -> Growth:
     start, stop = growth_window(task)
     events = events_of(task, steps)
     return Growth(first=first, last=max(1, round(last)), start=start, stop=stop, power=0.5, events=events)
+
+
+def stereo_points(task: Task, last: float) -> int:
+    """Returns the points by stereo that a run begins with, of so many rows when growth ends."""
+    if not with_stereo(task):
+        return 0
+    return max(0, round(task.options.stereo * last - task.measurement.primitives))
 
 
 def events_of(task: Task, steps: int) -> float:
@@ -225,6 +243,8 @@ def changes_of(task: Task, plan: Plan) -> Mapping[str, Any]:
     if chooses_size(task.settings, fixed):
         changes[SIZE] = plan.downscale
     changes |= capacity_of(values, fixed, plan.primitives)
+    if with_stereo(task):
+        changes[STEREO] = stereo_points(task, plan.primitives)
     if PASSES in values and PASSES not in fixed:
         changes[PASSES] = passes_of(task, plan)
     return changes | deadline_of(values, plan)

@@ -2,6 +2,7 @@
 
 import logging
 import statistics
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -28,6 +29,7 @@ from gsx.experiments.runs.evaluate import competitor_of
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.rasterizer_path import warm
 from gsx.experiments.runs.settings import Settings
+from gsx.scenes.stereo import SOURCES, depth_map, reduced
 
 logger = logging.getLogger(__name__)
 
@@ -74,6 +76,7 @@ def measure(
     small, large = (median_step(run, options) for _ in range(COARSE))
     pixels = statistics.fmean(view.camera.width * view.camera.height for view in scene.train)
     megapixel = max(large - small, LEAST * large) / (pixels * (1 - COARSE**-2)) * MILLION
+    drawn = getattr(short.scene.options, "random_points", 0) == len(scene.points)
     measurement = Measurement(
         base=max(0.0, large - megapixel * pixels / MILLION),
         megapixel=megapixel,
@@ -85,9 +88,20 @@ def measure(
         check=median_seconds(run, lambda view: render(run, view.camera), scene.test[:SAMPLES]),
         path=run.raster.path,
         device=run.device.type,
-        random=getattr(short.scene.options, "random_points", 0) == len(scene.points),
+        random=drawn,
+        stereo=0.0 if drawn else stereo_seconds(scene),
     )
     return measurement, scene
+
+
+def stereo_seconds(scene: Scene) -> float:
+    """Returns the seconds that depths by stereo take for a photo; 0 without points."""
+    if not len(scene.points):
+        return 0.0
+    first, second = (reduced(view) for view in scene.train[:2])
+    start = time.perf_counter()
+    depth_map(first, [second] * SOURCES, scene.points)
+    return time.perf_counter() - start
 
 
 def probe_changes(options: ProbeOptions) -> dict[str, Any]:

@@ -28,6 +28,7 @@ NOT_COMPARED = "eval.competitor"
 UNCHANGED = {
     "scene.model": "auto",
     "scene.distances": "even",
+    "scene.stereo": 0,
     "scene.similar": 10,
     "scene.near": 2,
     "scene.retry_pairs": 2000,
