@@ -1,4 +1,4 @@
-"""Starting points by stereo: the same runs with and without them (docs/benchmarks/stereo.md).
+"""Starting points by stereo: the same runs with and without them (docs/benchmarks/capacity.md).
 
     python benchmarks/stereo.py [--scenes FOLDER] [--only demo,room,fox,castle,desk_bottle,office] [--seeds 0,1]
 
