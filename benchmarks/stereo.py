@@ -2,7 +2,7 @@
 
     python benchmarks/stereo.py [--scenes FOLDER] [--only demo,room,fox,castle,desk_bottle,office] [--seeds 0,1]
 
-Runs of one scene have the same steps and the same number of primitives when growth ends. FOLDER holds the captures.
+Runs of one scene have the same steps and the same budget of primitives. FOLDER holds the captures.
 Finished runs below --runs are not trained again.
 """
 
