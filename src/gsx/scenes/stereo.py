@@ -108,17 +108,17 @@ def reduced(view: View) -> Reduced:
 
 def neighbours(cameras: Sequence[Camera], positions: Float[Tensor, "P 3"]) -> list[list[int]]:
     """Returns for each camera those to compare it with: by common points, weighted by the angle of their rays."""
-    shown = torch.stack([camera.shows(*camera.project(positions)) for camera in cameras])
+    visible = torch.stack([camera.shows(*camera.project(positions)) for camera in cameras])
     centres = torch.stack([camera.centre.double() for camera in cameras])
     rays = normalize(positions.double() - centres[:, None], dim=2)
-    return [best_partners(index, rays, shown) for index in range(len(cameras))]
+    return [best_partners(index, rays, visible) for index in range(len(cameras))]
 
 
-def best_partners(index: int, rays: Float[Tensor, "N P 3"], shown: Bool[Tensor, "N P"]) -> list[int]:
+def best_partners(index: int, rays: Float[Tensor, "N P 3"], visible: Bool[Tensor, "N P"]) -> list[int]:
     """Returns the cameras that share most points with one, at useful angles."""
     angles = torch.rad2deg((rays * rays[index]).sum(2).clamp(-1, 1).acos())
     width = torch.where(angles < ANGLE, NARROW, WIDE)
-    scores = ((-((angles - ANGLE) / width).square() / 2).exp() * (shown & shown[index])).sum(1)
+    scores = ((-((angles - ANGLE) / width).square() / 2).exp() * (visible & visible[index])).sum(1)
     scores[index] = 0
     best = scores.topk(min(SOURCES, len(scores)))
     return [number for number, score in zip(best.indices.tolist(), best.values.tolist(), strict=True) if score > 0]
@@ -154,7 +154,7 @@ def window_means(values: Float[Tensor, "*S n"]) -> Float[Tensor, "*S n"]:
 
 def correlations(reference: Reduced, source: Reduced, depths: Float[Tensor, "D"]) -> Float[Tensor, "D h w"]:
     """Returns the correlation of patches with a source at each depth; -1 outside the source."""
-    places, inside = seen_at(reference.camera, source.camera, depths)
+    places, inside = projected_at(reference.camera, source.camera, depths)
     grey, other = reference.grey[None], source.grey[None, None]
     warped = grid_sample(other, places[None], padding_mode="border", align_corners=False)[0].reshape(inside.shape)
     means, warped_means = patch_means(grey), patch_means(warped)
@@ -164,7 +164,7 @@ def correlations(reference: Reduced, source: Reduced, depths: Float[Tensor, "D"]
     return torch.where(inside, covariance / (variance * warped_variance).sqrt(), -1.0).clamp(-1, 1)
 
 
-def seen_at(
+def projected_at(
     camera: Camera, other: Camera, depths: Float[Tensor, "D"]
 ) -> tuple[Float[Tensor, "Dh w 2"], Bool[Tensor, "D h w"]]:
     """Returns where another camera sees each pixel at each depth, in [-1, 1], and which of them it shows."""
@@ -245,10 +245,10 @@ def confirmed(
 def agrees(camera: Camera, other: DepthMap, positions: Float[Tensor, "P 3"]) -> Int[Tensor, "P"]:
     """Returns 1 for points at the depth that another photo has measured in their place, else 0."""
     pixels, depths = camera.project(positions)
-    shown = camera.shows(pixels, depths)
+    visible = camera.shows(pixels, depths)
     column, row = (pixels.nan_to_num(0.0).long().clamp_min(0)).unbind(1)
     place = row.clamp_max(camera.height - 1), column.clamp_max(camera.width - 1)
-    return (shown & other.measured[place] & ((other.depths[place] - depths).abs() < TOLERANCE * depths)).int()
+    return (visible & other.measured[place] & ((other.depths[place] - depths).abs() < TOLERANCE * depths)).int()
 
 
 def colours_of(photo: Reduced, places: Bool[Tensor, "P"]) -> UInt8[Tensor, "M 3"]:
