@@ -129,3 +129,17 @@ def test_places_seen_from_several_photos_are_listed_once() -> None:
     """Two photos of one spot, and no others."""
     found = retakes([facing(0.0), facing(0.01), facing(20.0)], plane)
     assert [round(float(one.place.point[0])) for one in found] == [0, 20]
+
+
+def test_a_small_object_before_nothing_is_a_place() -> None:
+    """A strip of 0.8 in a frame of 2, which one photo shows: all of what is there is thin."""
+
+    def strip(camera: Camera) -> tuple[Tensor, Tensor]:
+        depth, _ = plane(camera)
+        across = camera.centre[0] + depth * slopes_of(camera)[..., 0]
+        alpha = (across.abs() < 0.4).float()
+        return depth * alpha, alpha
+
+    (found,) = retakes([facing(0.0), facing(20.0)], strip)
+    assert (found.place.view.name, found.place.part, found.place.share) == ("0.jpg", "", 1.0)
+    assert found.place.excess == pytest.approx(0.4 * 0.5, abs=0.03)
