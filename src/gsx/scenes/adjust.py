@@ -68,7 +68,10 @@ def adjusted_model(model: Model, proposed: Proposal | None, chosen: Decision) ->
 
 def unusual_cameras(model: Model, photos: Path) -> list[str]:
     """Return a note if focal lengths of a model differ beyond their uncertainty, although nothing is adjusted."""
-    proposed = proposal(model, lenses_of(model, photos) if len(model.cameras) > 1 else {})
+    try:
+        proposed = proposal(model, lenses_of(model, photos) if len(model.cameras) > 1 else {})
+    except InputError:  # of a lens: the first photo that needs it is refused by name
+        return []
     return [f"Cameras: {evidence_words(model, proposed)}."] if proposed and proposed.unusual else []
 
 
