@@ -223,5 +223,6 @@ def test_a_file_is_converted_from_given_axes_into_version_4(
 
 
 def test_flags_of_spz_for_another_file_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "run").mkdir()
     assert main(["export", str(tmp_path / "run"), str(tmp_path / "a.ply"), "--spz-version", "4"]) == 2
     assert "SPZ version are for .spz files" in capsys.readouterr().err

@@ -37,6 +37,7 @@ def today(words: list[str]) -> list[str]:
                 "training.coarse=4",
                 "training.coarse_until=0.3",
                 "training.exposure.when=auto",
+                "training.trial.steps=0",
             ],
             "562b50519a100352",
         ),

@@ -61,7 +61,7 @@ def unchanged(config: dict[str, Any]) -> list[str]:
         if all(values.get(f"{key}.{name}", ...) == value for name, value in neutral.items())
     ]
     tested = any(key.endswith(".when") and value == "auto" for key, value in values.items())
-    trial = [] if tested else [TRIAL]
+    trial = [TRIAL] if not tested or not values.get(f"{TRIAL}.steps") else []
     return [*nodes, *trial, *(key for key, value in values.items() if UNCHANGED.get(key, ...) == value)]
 
 
