@@ -30,6 +30,7 @@ import gsx
 from gsx.core.errors import first_line
 from gsx.core.files import replacing
 from gsx.engine.cache import content_key, creation_lock, file_stamp, source_digest, source_files
+from gsx.engine.half_libraries import remove_half_libraries
 from gsx.engine.machine import processor_kind
 
 logger = logging.getLogger(__name__)
@@ -265,11 +266,8 @@ class CachedFunction:
         return None, file
 
     def make(self, file: Path, arguments: Arguments) -> Code:
-        """Compiles code and saves it.
-
-        Raises:
-            ValueError: it does not hold for these arguments.
-        """
+        """Compiles code and saves it; ValueError: it does not hold for these arguments."""
+        remove_half_libraries()
         try:
             compiled = self.compile(arguments)
         except Exception as error:
