@@ -2,6 +2,7 @@
 
 import os
 import struct
+from contextlib import suppress
 from pathlib import Path
 
 HEADER = struct.Struct("<4x1x1x34xQ10xHH2x")
@@ -9,11 +10,15 @@ HEADER = struct.Struct("<4x1x1x34xQ10xHH2x")
 
 
 def remove_half_libraries() -> None:
-    """Removes unfinished libraries from torch's cache, if gsx has chosen its folder."""
+    """Removes unfinished libraries from torch's cache, if gsx has chosen its folder.
+
+    A linker at work in another process writes the header last, just before the table.
+    """
     folder = os.environ.get("TORCHINDUCTOR_CACHE_DIR")
     for library in Path(folder).rglob("*.so") if folder else ():
-        if is_unfinished(library):
-            library.unlink(missing_ok=True)
+        with suppress(OSError):  # another process has removed it, or owns it
+            if is_unfinished(library):
+                library.unlink()
 
 
 def is_unfinished(library: Path) -> bool:
