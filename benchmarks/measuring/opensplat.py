@@ -6,14 +6,11 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
-from gsx.core.data.scene import PointCloud, Scene, View
+from gsx.core.data.scene import Scene, View
 from gsx.core.files import write_json
+from gsx.experiments.prepare.colmap_files import write_model
 from measuring.runs import clock_of
 
 WRAPPER = """\
@@ -37,20 +34,14 @@ def write_scene(scene: Scene, folder: Path) -> Path:
     Raises:
         ValueError: a principal point is off the centre, which OpenSplat ignores.
     """
-    import pycolmap
-
     for view in scene.train:
         refuse_off_centre(view)
-    for part in (IMAGES, MODEL):
-        (folder / part).mkdir(parents=True, exist_ok=True)
-    model = pycolmap.Reconstruction()
-    for number, view in enumerate(scene.train, start=1):
-        image = pycolmap.Image(name=f"{number:04d}.png", camera_id=number, image_id=number)
-        write_image(folder / IMAGES / image.name, view.picture())
-        model.add_camera_with_trivial_rig(colmap_camera(view.camera, number))
-        model.add_image_with_trivial_frame(image, pose_of(view.camera, scene.origin))
-    add_points(model, scene.points, scene.origin)
-    model.write_binary(folder / MODEL)
+    (folder / IMAGES).mkdir(parents=True, exist_ok=True)
+    names = [f"{number:04d}.png" for number in range(1, len(scene.train) + 1)]
+    for name, view in zip(names, scene.train, strict=True):
+        write_image(folder / IMAGES / name, view.picture())
+    cameras = [(name, view.camera) for name, view in zip(names, scene.train, strict=True)]
+    write_model(folder / MODEL, cameras, scene.points, scene.origin)
     return folder
 
 
@@ -63,31 +54,6 @@ def refuse_off_centre(view: View) -> None:
             f"the principal point of '{view.name}' is {off:.2f} px off the centre, which OpenSplat ignores: compare "
             "on scene.principal_point=centred"
         )
-
-
-def colmap_camera(camera: Camera, number: int) -> Any:
-    """Returns a pinhole camera of COLMAP."""
-    import pycolmap
-
-    params = [camera.fx, camera.fy, camera.cx, camera.cy]
-    return pycolmap.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=params, camera_id=number)
-
-
-def pose_of(camera: Camera, origin: Sequence[float]) -> Any:
-    """Returns the pose, camera from world, in the coordinates of the scene's files."""
-    import pycolmap
-
-    rotation = camera.rotation.double().numpy()
-    translation = camera.translation.double().numpy() - rotation @ np.asarray(origin)
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
-
-
-def add_points(model: Any, points: PointCloud, origin: Sequence[float]) -> None:
-    """Adds the initial points, without observations."""
-    import pycolmap
-
-    for place, colour in zip(points.positions.double().numpy(), points.colours.numpy(), strict=True):
-        model.add_point3D(place + np.asarray(origin), pycolmap.Track(), colour)
 
 
 def file_of(place: Path) -> Path:

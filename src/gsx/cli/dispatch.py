@@ -10,6 +10,7 @@ from typing import Any
 from gsx import __version__
 from gsx.cli import arguments as parsers
 from gsx.cli.exit_codes import discard_unwritten, report_closed_output, report_error
+from gsx.cli.prepare_arguments import parse_prepare
 from gsx.core.errors import ConfigError, nearest
 from gsx.core.files import expand_home
 from gsx.engine.collector import loading
@@ -29,6 +30,7 @@ gsx trains 3D Gaussian splats from photos, zooms in, and measures how much of th
 
 More commands; view, eval and export also take splat files of other programs:
   gsx scenes FOLDER          check photos before training: format, cameras, sharpness, exposure, coverage
+  gsx prepare FOLDER --to OUT  write a scene for other programs: photos, COLMAP model, transforms.json, test cameras
   gsx photographs RUN        find training photos with wrong exposure or pose, blur or passers-by
   gsx render RUN             save test views as PNG; animate --orbit FILE.gif or a camera --path FILE.json
   gsx compact RUN            shrink a model while PSNR drops by at most --max-drop-db 0.1
@@ -145,6 +147,7 @@ VERBS = {
     "compact": command(parsers.parse_compact, "runs", "compact_model"),
     "report": command(parsers.parse_report, "facts", "report"),
     "scenes": command(parsers.parse_scenes, "facts", "check_scene"),
+    "prepare": command(parse_prepare, "prepare", "prepare_scene"),
     "datasets": command(parsers.parse_datasets, "facts", "list_datasets"),
     "explain": command(parsers.parse_explain, "facts", "explain_key"),
     "plugins": command(parsers.parse_plugins, "facts", "list_plugins"),

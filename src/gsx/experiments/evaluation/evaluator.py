@@ -217,7 +217,7 @@ class Evaluator:
         if drawing is not None:
             drawing.choose(views)
         evaluation = {
-            "protocol": protocol_of(run, self.options, self.lpips.name if self.lpips else "n/a (no weights)"),
+            "protocol": protocol_of(run.scene, self.options, self.lpips.name if self.lpips else "n/a (no weights)"),
             "step": run.step,
             **{key: mean([v[key] for v in views]) for key in figures},
             **self.perceptual.summary(views),

@@ -4,18 +4,18 @@ import hashlib
 import json
 from typing import Any
 
-from gsx.core.training.run import Run
+from gsx.core.data.scene import Scene
 from gsx.experiments.evaluation.eval_options import EvalOptions
 
 
-def protocol_of(run: Run, options: EvalOptions, lpips_name: str) -> dict[str, Any]:
+def protocol_of(scene: Scene, options: EvalOptions, lpips_name: str) -> dict[str, Any]:
     """Returns what two results must share to be compared, and its hash."""
     protocol: dict[str, Any] = {
-        "scene": {key: value for key, value in run.scene.provenance.items() if key != "notes"},
-        "test_views": [view.name for view in run.scene.test],
-        "train_views": len(run.scene.train),
-        "size": list((*run.scene.test, *run.scene.train)[0].camera.size),
-        "background": run.scene.background.tolist(),
+        "scene": {key: value for key, value in scene.provenance.items() if key != "notes"},
+        "test_views": [view.name for view in scene.test],
+        "train_views": len(scene.train),
+        "size": list((*scene.test, *scene.train)[0].camera.size),
+        "background": scene.background.tolist(),
         "quantised_to_8_bit": options.quantise,
         "psnr": "mean over views of 20 log10(1/sqrt(MSE)), all pixels and channels",
         "ssim": options.ssim,

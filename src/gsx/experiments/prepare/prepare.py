@@ -1,0 +1,154 @@
+"""Writes a scene for other programs: `gsx prepare`."""
+
+import json
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsx import __version__
+from gsx.core.data.images import write_image
+from gsx.core.data.scene import View
+from gsx.core.files import finite, replace_text, write_json
+from gsx.core.plugins import Plugins
+from gsx.core.shapes import UInt8
+from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.lpips import load_lpips
+from gsx.experiments.evaluation.protocol import protocol_of
+from gsx.experiments.prepare.colmap_files import write_model
+from gsx.experiments.prepare.content import Prepared, content_of
+from gsx.experiments.prepare.doubts import doubts_about
+from gsx.experiments.prepare.picture_names import every_eighth_is_test
+from gsx.experiments.prepare.readme import readme_of
+from gsx.experiments.prepare.repeated import repeating_words
+from gsx.experiments.prepare.transforms_file import write_transforms
+from gsx.experiments.prepare.whole_folder import MANIFEST, is_prepared, refuse_occupied, whole_folder
+from gsx.experiments.prepare.zoom_cameras import Zoomed, write_zoom, zoom_name
+from gsx.experiments.runs.compose import compose
+from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.progress import Countdown
+
+logger = logging.getLogger(__name__)
+
+FORMAT = 1
+"""Version of the folder's layout."""
+README, NAMES = "README.txt", "test_views.txt"
+
+Advance = Callable[[float, str], None]
+"""Callback after each picture: its size in units of a training picture, and its name."""
+
+
+def prepare(
+    words: Sequence[str], to: Path, plugins: Plugins, with_test: bool = False, with_truth: bool = False
+) -> Path:
+    """Write the scene of a composition for other programs; return the folder.
+
+    A folder that was prepared with the same settings stays as it is.
+
+    Args:
+        words: Overrides, as for training.
+        to: Folder to write.
+        plugins: Loaded components.
+        with_test: Put test photos into `images/` as well.
+        with_truth: Write test photos at each zoom to `truth/xK/`.
+
+    Raises:
+        ConfigError: a setting is wrong.
+        InputError: the scene cannot be loaded, `to` holds something else, or a zoom has no truth.
+    """
+    refuse_occupied(to)
+    settings = compose(words, plugins)
+    scene = load_scene(settings)
+    for note in scene.notes:
+        logger.info("note: %s", note)
+    content = content_of(scene, settings.evaluation.zoom, with_test, with_truth)
+    repeated = repeating_words(settings, plugins)
+    manifest = json.loads(json.dumps(finite(manifest_of(content, settings.evaluation, repeated)), default=str))
+    if is_prepared(to, manifest):
+        logger.info("%s was prepared with these settings before: it stays as it is", to)
+        return to
+    for doubt in doubts_about(content):
+        logger.warning("%s", doubt)
+    with whole_folder(to) as folder:
+        write_folder(folder, content, manifest, Countdown("preparing", content.work()).advance)
+    logger.info("prepared %d training and %d test views of scene %s", len(scene.train), len(scene.test), scene.name)
+    return to
+
+
+def manifest_of(content: Prepared, options: EvalOptions, words: Sequence[str]) -> dict[str, Any]:
+    """Return the content of prepared.json; `words`: overrides that load the same scene and evaluation."""
+    scene, lpips = content.scene, load_lpips(options.lpips)
+    return {
+        "format": FORMAT,
+        "gsx": __version__,
+        "scene": scene.name,
+        "overrides": list(words),
+        "zooms": list(content.zoomed),
+        "with_test": content.with_test,
+        "with_truth": content.with_truth,
+        "every_8th_is_test": every_eighth_is_test(content.train, content.test),
+        "filter": scene.reduction.filter,
+        "light": scene.reduction.light,
+        "background": scene.background.tolist(),
+        "masks": content.masked,
+        "protocol": protocol_of(scene, options, lpips.name if lpips else "n/a (no weights)"),
+        "train": [{"name": picture.name, "file": f"images/{picture.file}"} for picture in content.train],
+        "test": [{"name": p.name, "file": p.file, "sizes": sizes_of(p.file, content.zoomed)} for p in content.test],
+    }
+
+
+def sizes_of(file: str, zoomed: dict[float, Zoomed]) -> dict[str, list[int]]:
+    """Return width and height of a test view by zoom, px."""
+    return {f"{factor:g}": list(views[file].camera.size) for factor, views in zoomed.items() if file in views}
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def write_folder(folder: Path, content: Prepared, manifest: dict[str, Any], advance: Advance) -> None:
+    """Write all files; the manifest is the last one."""
+    scene, points, origin = content.scene, content.scene.points, content.scene.origin
+    write_photos(folder, content, advance)
+    write_model(folder / "sparse" / "0", [(p.file, p.camera) for p in content.pictures], points, origin)
+    everything = [(picture.file, picture.camera) for picture in [*content.train, *content.test]]
+    write_model(folder / "all_views" / "sparse" / "0", everything, points, origin)
+    held_out = content.test if content.with_test else []
+    write_transforms(folder, content.pictures, held_out, points, origin, content.masked)
+    for factor, views in content.zoomed.items():
+        write_zoom(folder, scene, factor, views)
+        if content.with_truth:
+            write_truth(folder / "truth" / zoom_name(factor), factor, views, advance)
+    replace_text(folder / NAMES, "".join(f"{picture.file}\n" for picture in content.test))
+    replace_text(folder / README, readme_of(content.scene.name, manifest))
+    write_json(folder / MANIFEST, manifest)
+
+
+def write_photos(folder: Path, content: Prepared, advance: Advance) -> None:
+    """Write photos as gsx trains on them, and their masks: white pixels count."""
+    (folder / "images").mkdir()
+    if content.masked:
+        (folder / "masks").mkdir()
+    for picture in content.pictures:
+        write_image(folder / "images" / picture.file, picture.view.picture())
+        if content.masked:
+            write_image(folder / "masks" / picture.file, mask_of(picture.view))
+        advance(1, picture.file)
+
+
+def mask_of(view: View) -> UInt8[Tensor, "1 H W"]:
+    """Return the mask of a view as a grey picture, uint8 [1, H, W]; white: it counts."""
+    counted = view.counted()
+    width, height = view.camera.size
+    counted = torch.ones(height, width) if counted is None else counted
+    return (counted[None] * 255).byte()
+
+
+def write_truth(folder: Path, factor: float, views: Zoomed, advance: Advance) -> None:
+    """Write the test photos at a zoom."""
+    folder.mkdir(parents=True)
+    for file, view in views.items():
+        write_image(folder / file, view.picture())
+        advance(factor**2, f"{file} {zoom_name(factor)}")
