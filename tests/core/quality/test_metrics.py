@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.quality import metrics
-from gsx.core.quality.metrics import SSIM_VARIANTS, bicubic, psnr, quantise, ssim
+from gsx.core.quality.metrics import ROUNDINGS, SSIM_VARIANTS, bicubic, psnr, quantise, ssim
 
 
 def pictures(height: int, width: int, noise: float = 0.15, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -116,9 +116,16 @@ def test_quantise_rounds_to_the_nearest_byte_and_clamps() -> None:
     assert torch.equal(quantise(values.view(1, 1, -1)), expected.view(1, 1, -1))
 
 
-def test_bytes_survive_quantising() -> None:
+def test_quantise_truncates_and_clamps_on_request() -> None:
+    values = torch.tensor([-0.3, 0.0, 0.4 / 255, 0.9 / 255, 127.4 / 255, 127.9 / 255, 254.9 / 255, 1.0, 1.7])
+    expected = torch.tensor([0.0, 0, 0, 0, 127, 127, 254, 255, 255]) / 255
+    assert torch.equal(quantise(values.view(1, 1, -1), "down"), expected.view(1, 1, -1))
+
+
+@pytest.mark.parametrize("rounding", ROUNDINGS)
+def test_bytes_survive_quantising(rounding: str) -> None:
     levels = torch.arange(256).view(1, 16, 16) / 255
-    assert torch.equal(quantise(levels), levels)
+    assert torch.equal(quantise(levels, rounding), levels)
 
 
 def test_bicubic_reproduces_a_ramp_and_clamps_overshoot() -> None:

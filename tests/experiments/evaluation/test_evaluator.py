@@ -1,16 +1,20 @@
 """The figures of an evaluation, worked by hand from pictures of one grey each."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import pytest
 import torch
-from evaluating import GROUPS, LEVELS, TRUTH, Brighter, close, decibels, run_of
+from evaluating import GROUPS, LEVELS, TRUTH, Brighter, Grey, close, decibels, run_of
 from torch import Tensor
 
+from gsx.core.data.camera import Camera
 from gsx.core.errors import InputError
+from gsx.core.quality.metrics import ssim
 from gsx.experiments.evaluation.chosen_views import evenly
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluator import Evaluator
@@ -18,11 +22,14 @@ from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.evaluation.perceptual import NamedMetric, PerceptualMetrics
 
 
-def evaluated(folder: Path, quantise: bool = True) -> dict[str, Any]:
+def plain_options() -> EvalOptions:
+    """Windows lie inside: of one grey each, so that SSIM is its first factor."""
     lpips = LpipsOptions(trunk="", head="", net="vgg", input_range="unit")
-    # windows that lie inside: of one grey each, so that SSIM is its first factor
-    options = EvalOptions(zoom=[1, 2, 8], quantise=quantise, ssim="valid", tile_pixels=1 << 20, lpips=lpips)
-    return Evaluator(run_of(folder), options).evaluate()
+    return EvalOptions(zoom=[1, 2, 8], quantise=True, ssim="valid", tile_pixels=1 << 20, lpips=lpips)
+
+
+def evaluated(folder: Path, quantise: bool = True) -> dict[str, Any]:
+    return Evaluator(run_of(folder), replace(plain_options(), quantise=quantise)).evaluate()
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +110,54 @@ def test_unquantised_renders_are_measured_as_they_are(tmp_path: Path, figures: d
     assert found["psnr"] == close(decibels(10.4, 20, 50))
     assert found["zoom"]["2"]["enlarged_psnr"] == close(decibels(3.6, 11))
     assert found["protocol"]["hash"] != figures["protocol"]["hash"]
+
+
+def test_the_protocol_of_defaults_keeps_its_hash(figures: dict[str, Any]) -> None:
+    """Results from before `eval.rounding` and `eval.masks` stay comparable: digest of the code before them."""
+    text = {key: value for key, value in figures["protocol"].items() if key not in ("zoom", "hash")}
+    assert not {"rounding", "masks"} & text.keys()
+    assert figures["protocol"]["hash"] == "4e444cd1677f859f"
+
+
+def test_renders_are_truncated_on_request(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, figures: dict[str, Any]
+) -> None:
+    """100.7 is 101 to the nearest level, and 100 truncated: 10 off instead of 11. At x2 109.6 is 109, 5 off."""
+    monkeypatch.setitem(LEVELS, "a", {1: 100.7, 2: 109.6})
+    options = replace(plain_options(), zoom=[1, 2])
+    near, down = (
+        Evaluator(run_of(tmp_path), replace(options, rounding=rounding)).evaluate() for rounding in ("nearest", "down")
+    )
+    assert (near["psnr"], down["psnr"]) == (close(decibels(11, 20, 50)), close(decibels(10, 20, 50)))
+    assert (near["zoom"]["2"]["psnr"], down["zoom"]["2"]["psnr"]) == (close(decibels(6, 1)), close(decibels(5, 1)))
+    assert down["protocol"]["rounding"] == "down"
+    assert down["protocol"]["hash"] != near["protocol"]["hash"]
+
+
+class HalfMasked(Grey):
+    """The left half does not count."""
+
+    def counted(self, camera: Camera) -> Tensor:
+        columns = torch.arange(camera.width) >= camera.width // 2
+        return columns.expand(camera.height, camera.width)
+
+
+def test_masked_pixels_count_as_equal_on_request(tmp_path: Path) -> None:
+    """Half of the squared error over all pixels: 3.01 dB more. Detail stays unknown."""
+    run = run_of(tmp_path, HalfMasked)
+    run.scene.provenance["masks"] = "by hand"
+    left_out, black = (
+        Evaluator(run, replace(plain_options(), zoom=[1, 2], masks=masks)).evaluate() for masks in ("excluded", "black")
+    )
+    assert left_out["psnr"] == close(decibels(10, 20, 50))
+    assert black["psnr"] == close(decibels(10, 20, 50) + 10 * math.log10(2))
+    assert black["zoom"]["2"]["psnr"] == close(decibels(6, 1) + 10 * math.log10(2))
+    assert "detail" not in black["zoom"]["2"]
+    greys = torch.full((3, 16, 24), 100 / 255), torch.full((3, 16, 24), 90 / 255)
+    for grey in greys:
+        grey[..., :12] = 0
+    assert black["views"][0]["ssim"] == close(ssim(*greys, "valid"))
+    assert black["protocol"]["hash"] != left_out["protocol"]["hash"]
 
 
 def test_fitted_colours_are_those_of_the_left_half_and_judged_on_the_right(

@@ -12,13 +12,14 @@ from gsx.core.quality.similarity import WINDOW
 from gsx.core.shapes import Bool, Float
 
 SSIM_VARIANTS = ("inria", "torchmetrics", "valid")
+ROUNDINGS = ("nearest", "down")
 STRIP_PIXELS = 1 << 16
 """Pixels per strip of SSIM; nine maps of a strip take 2.4 MB."""
 
 
-def quantise(image: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
-    """Rounds to 8 bits as in a saved PNG: x 255, + 0.5, clamp, truncate."""
-    return (image * 255 + 0.5).clamp(0, 255).floor() / 255
+def quantise(image: Float[Tensor, "C H W"], rounding: str = "nearest") -> Float[Tensor, "C H W"]:
+    """Rounds to 8 bits: x 255, + 0.5 if `nearest` (torchvision's PNGs), clamped, truncated; `down` as nerfbaselines."""
+    return (image * 255 + (0.5 if rounding == "nearest" else 0.0)).clamp(0, 255).floor() / 255
 
 
 def psnr(

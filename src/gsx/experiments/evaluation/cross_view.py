@@ -202,7 +202,8 @@ class CrossViews:
         """Renders the depth of a zoomed view."""
         camera = self.renders.camera(zoomed.view)
         depth, alpha = depth_and_coverage(self.run, camera, self.options.tile_pixels)
-        surface = surface_of(camera, depth, alpha, zoomed.counted)
+        mask = zoomed.view.counted()
+        surface = surface_of(camera, depth, alpha, mask if zoomed.counted is None else zoomed.counted)
         pictures: dict[str, Tensor] = zoomed.pictures(COMPARED)
         if self.options.quantise:
             pictures = {name: to_uint8(picture) for name, picture in pictures.items()}
@@ -210,7 +211,7 @@ class CrossViews:
             surface=surface,
             stored=pictures,
             size=(view.camera.height, view.camera.width),
-            masked=zoomed.view.counted() is not None,
+            masked=mask is not None,
         )
 
     def figures(self, factor: float) -> dict[str, dict[str, object]]:

@@ -3,12 +3,15 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from gsx.core.quality.metrics import SSIM_VARIANTS
+from gsx.core.quality.metrics import ROUNDINGS, SSIM_VARIANTS
 from gsx.core.ranges import Range
 from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.evaluation.perceptual import METRICS
 
 COLOURS, POSES = ("rendered", "fitted"), ("given", "aligned")
+MASKS = ("excluded", "black")
+CHOICES = {"ssim": SSIM_VARIANTS, "rounding": ROUNDINGS, "masks": MASKS, "colours": COLOURS, "poses": POSES}
+"""Values of options by name."""
 LEAST_WINDOW_PIXELS = 1 << 16
 """Four windows of 128 px, in which networks see more than borders."""
 LEAST_TILE_PIXELS = 16 * 16
@@ -44,6 +47,10 @@ class EvalOptions(MetricOptions):
     tile_pixels: Annotated[int, Range(LEAST_TILE_PIXELS, 1 << 31)]
     supersample: Annotated[int, Range(0, 16)] = 0
     """Factor by which renders are finer than each picture before they are reduced; 0: as in training."""
+    rounding: str = "nearest"
+    """nearest: to the nearest of 256 levels; down: to the next lower one. Without effect unless quantised."""
+    masks: str = "excluded"
+    """excluded: PSNR and SSIM leave masked pixels out; black: they count, black in both pictures."""
     colours: str = "rendered"
     """rendered: as the model renders them; fitted: corrected by one colour matrix per view, fitted on its left half and
     evaluated on its right half."""
@@ -60,12 +67,9 @@ class EvalOptions(MetricOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.ssim not in SSIM_VARIANTS:
-            raise ValueError(f"eval.ssim is '{self.ssim}'; choose from {', '.join(SSIM_VARIANTS)}")
-        if self.colours not in COLOURS:
-            raise ValueError(f"eval.colours is '{self.colours}'; choose from {', '.join(COLOURS)}")
-        if self.poses not in POSES:
-            raise ValueError(f"eval.poses is '{self.poses}'; choose from {', '.join(POSES)}")
+        for name, known in CHOICES.items():
+            if getattr(self, name) not in known:
+                raise ValueError(f"eval.{name} is '{getattr(self, name)}'; choose from {', '.join(known)}")
         if not self.zoom:
             raise ValueError("eval.zoom is empty; give factors, for example [1,2,4]")
 

@@ -65,6 +65,7 @@ class EvaluatedRenders:
         Raises:
             InputError: there are none.
         """
+        counted = None if self.options.masks == "black" else counted
         if not self.options.right_halves:
             return counted
         right = half(view, counted, right=True)

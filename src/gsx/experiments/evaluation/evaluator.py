@@ -92,7 +92,7 @@ class Evaluator:
 
     def measured(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
         """Returns a picture as metrics get it: quantised to 8 bits if the protocol says so."""
-        return quantise(image) if self.options.quantise else image
+        return quantise(image, self.options.rounding) if self.options.quantise else image
 
     def view(self, view: View) -> dict[str, Any]:
         """Measures one view at the training resolution."""

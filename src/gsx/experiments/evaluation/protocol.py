@@ -7,6 +7,12 @@ from typing import Any
 from gsx.core.data.scene import Scene
 from gsx.experiments.evaluation.eval_options import EvalOptions
 
+MASKED = {
+    "excluded": "PSNR and SSIM over the pixels that count, the others black in all pictures",
+    "black": "PSNR and SSIM over all pixels, those that do not count black in all pictures",
+}
+"""Rules for masks, by `eval.masks`."""
+
 
 def protocol_of(scene: Scene, options: EvalOptions, lpips_name: str) -> dict[str, Any]:
     """Returns what two results must share to be compared, and its hash."""
@@ -23,7 +29,9 @@ def protocol_of(scene: Scene, options: EvalOptions, lpips_name: str) -> dict[str
         "enlarged": "x1 render, antialiased Keys bicubic",
     }
     if "masks" in protocol["scene"]:
-        protocol |= {"masks": "PSNR and SSIM over the pixels that count, the others black in all pictures"}
+        protocol |= {"masks": MASKED[options.masks]}
+    if options.quantise and options.rounding != "nearest":
+        protocol |= {"rounding": options.rounding}
     if options.colours == "fitted":
         protocol |= {"colours": "3x4 matrix a view, least squares on the left half; all figures of the right half"}
     if options.poses == "aligned":

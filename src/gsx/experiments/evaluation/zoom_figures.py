@@ -34,7 +34,8 @@ def measure_zoom(zoomed: Zoomed, ssim: Ssim, perceptual: Figures) -> ZoomFigures
     There is no detail with a mask, whose border would be detail.
     """
     pictures = zoomed.pictures(DETAIL_OF)
-    details = details_of(pictures, zoomed.truth, zoomed.factor) if zoomed.counted is None else {}
+    whole = zoomed.counted is None and zoomed.view.counted() is None
+    details = details_of(pictures, zoomed.truth, zoomed.factor) if whole else {}
     return ZoomFigures(zoomed.view.group, zoom_figures(zoomed, ssim), details, perceptual)
 
 

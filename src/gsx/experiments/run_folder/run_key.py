@@ -32,6 +32,8 @@ UNCHANGED = {
     "scene.similar": 10,
     "scene.near": 2,
     "scene.retry_pairs": 2000,
+    "eval.rounding": "nearest",
+    "eval.masks": "excluded",
     "backbone.density.passes": 1.0,
     "backbone.clone_split.density.passes": 1.0,
 }
@@ -182,13 +184,17 @@ def finished(run: RunFiles, config: dict[str, Any], stamp: str, idle: Collection
 
 
 def evaluated_alike(saved: dict[str, Any], now: dict[str, Any]) -> bool:
-    """Return True if an evaluation was made by the settings of now; keys of EVALUATION that are newer do not count."""
-    return saved == now | {group: in_both(part(now, group), part(saved, group)) for group in EVALUATION}
+    """Return True if an evaluation was made by the settings of now.
+
+    Keys of EVALUATION that are newer do not count, except those of UNCHANGED that have another value.
+    """
+    return saved == now | {group: counting(group, part(now, group), part(saved, group)) for group in EVALUATION}
 
 
-def in_both(now: dict[str, Any], saved: dict[str, Any]) -> dict[str, Any]:
-    """Select the values of now whose keys are saved."""
-    return {key: value for key, value in now.items() if key in saved}
+def counting(group: str, now: dict[str, Any], saved: dict[str, Any]) -> dict[str, Any]:
+    """Select the values of now whose keys are saved, or whose key of UNCHANGED has another value."""
+    changed = {key for key, value in now.items() if UNCHANGED.get(f"{group}.{key}", value) != value}
+    return {key: value for key, value in now.items() if key in saved or key in changed}
 
 
 def comparable(config: dict[str, Any]) -> dict[str, Any]:

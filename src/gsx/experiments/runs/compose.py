@@ -18,6 +18,7 @@ from gsx.core.files import expand_home
 from gsx.core.plugins import Plugins, Registry
 from gsx.experiments.run_folder.general_options import GeneralOptions
 from gsx.experiments.runs.overrides import parse_overrides, refuse_absent_launcher, refuse_sweep, with_quoted_paths
+from gsx.experiments.runs.protocols import NamedProtocol, named_protocol, refuse_other_scene
 from gsx.experiments.runs.settings import Settings, settings_from
 from gsx.experiments.runs.typed import dotted, schema_keys, unknown_key
 
@@ -102,6 +103,11 @@ class Compositions:
         """Return a whole composition as plain values, unchecked."""
         return OmegaConf.to_container(self.composed(overrides), resolve=True)
 
+    def protocol(self, name: str) -> NamedProtocol:
+        """Return a protocol by name; raise ConfigError for an unknown one."""
+        check_choices("protocol", name, known_groups(), self.plugins.registry)
+        return named_protocol(name)
+
     def sources(self, overrides: Sequence[str]) -> list[Source]:
         """Return the files of a composition in the order of merging."""
         from hydra.core.global_hydra import GlobalHydra
@@ -151,9 +157,11 @@ def compose_raw(overrides: Sequence[str], registry: Registry | None = None) -> D
     overrides = with_quoted_paths(overrides)
     check_groups(overrides, registry)
     try:
-        return hydra_compose("config", overrides=overrides)
+        config = hydra_compose("config", overrides=overrides)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(explain(error, overrides)) from error
+    refuse_other_scene(overrides, config)
+    return config
 
 
 def check_groups(overrides: Sequence[str], registry: Registry | None = None) -> None:

@@ -1,6 +1,7 @@
 """config.yaml of a run folder: written, read back with overrides, and translated from older versions."""
 
 import dataclasses
+import json
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from gsx.experiments.run_folder.files import part, read_run
 from gsx.experiments.run_folder.general_options import GeneralOptions
 from gsx.experiments.run_folder.renamed import renamed
 from gsx.experiments.runs.compose import Compositions
+from gsx.experiments.runs.protocols import GROUP
 from gsx.experiments.runs.settings import (
     COMPETITOR,
     COMPETITOR_GROUP,
@@ -46,7 +48,7 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = (), spa
         ConfigError: the file is unreadable, an override names no such key, or no plugin provides a component.
     """
     config = with_newer_settings(saved_config(path))
-    for override in overrides:
+    for override in with_protocols(overrides, config, plugins, str(path.parent)):
         key, equals, value = override.partition("=")
         if not equals:
             raise ConfigError(f"'{override}' has no value: write {override}=VALUE")
@@ -61,6 +63,21 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = (), spa
         except Exception as error:  # the YAML parser has its own family of errors
             raise ConfigError(f"override '{override}' cannot be read: {first_line(error)}") from error
     return settings_without(absent_nodes(config, plugins), config, plugins, path.parent, spare)
+
+
+def with_protocols(overrides: Sequence[str], config: DictConfig, plugins: Plugins, place: str) -> Iterator[str]:
+    """Yield the values that each `protocol=NAME` sets, then the other overrides; `place`: the run's folder.
+
+    Raises:
+        ConfigError: a protocol is unknown, or the run was prepared otherwise.
+    """
+    for override in overrides:
+        if override.startswith(f"{GROUP}="):
+            with Compositions(plugins) as compositions:
+                protocol = compositions.protocol(override.partition("=")[2])
+            protocol.refuse_run(config, place)
+            yield from (f"{key}={json.dumps(value)}" for key, value in protocol.measuring.items())
+    yield from (override for override in overrides if not override.startswith(f"{GROUP}="))
 
 
 def absent_nodes(config: DictConfig, plugins: Plugins) -> dict[str, tuple[str, str]]:
