@@ -17,11 +17,13 @@ from pages import PAGES, ROOT
 SOURCE, SETTINGS = ROOT / "src" / "gsx", ROOT / "conf"
 COUNTS = Path(__file__).with_suffix(".json")
 DIALECT = re.compile(
-    r"(?<!=)\b(told|tells?|seen|shown|given|asked|judg(?:e|es|ed|ing)|begun|wanted|doomed|heal(?:s|ed)?|earn(?:s|ed)?|heeded"
-    r"|withheld|undone|beside|whoever|looked at|died without a word|taken for (?:right|wrong))\b",
+    r"(?<!=)(?<!gsx )\b(told|tells?|seen|shown|given|asked|judg(?:e|es|ed|ing)|begun|wanted|doomed|heal(?:s|ed)?"
+    r"|earn(?:s|ed)?|heeded|withheld|undone|beside|whoever|looked at|died without a word|taken for (?:right|wrong))\b",
     re.I,
 )
-"""Participles and metaphors in place of the field's nouns and verbs: report, evaluate, compare with, held-out."""
+"""Participles and metaphors in place of the field's nouns and verbs: report, evaluate, compare with, held-out.
+
+`gsx judge` is the name of a command."""
 FRAGMENT = re.compile(r"(What|Whether|Of|Those|Where|Which|Whose|How|That|Whatever|Whoever)\b")
 """First words of a docstring that is no sentence."""
 

@@ -10,6 +10,7 @@ from typing import Any
 from gsx import __version__
 from gsx.cli import arguments as parsers
 from gsx.cli.exit_codes import discard_unwritten, report_closed_output, report_error
+from gsx.cli.judge_arguments import parse_methods
 from gsx.cli.prepare_arguments import parse_prepare
 from gsx.core.errors import ConfigError, nearest
 from gsx.core.files import expand_home
@@ -26,6 +27,7 @@ gsx trains 3D Gaussian splats from photos, zooms in, and measures how much of th
   gsx view RUN               look around in the browser (pip install 'gsx[viewer]'); RUN is the folder of the report
   gsx resume RUN             continue an interrupted run; iterations=N trains longer
   gsx eval RUN 'eval.zoom=[1,2,4]'  measure a run again, here also zoomed in
+  gsx judge A=PATH B=PATH FOLDER  compare pictures or splats of any programs on test views; prepare writes them a scene
   gsx export RUN model.ply   write a splat file (.ply, .compressed.ply, .spz, .sog, .glb) or a web page (.html)
 
 More commands; view, eval and export also take splat files of other programs:
@@ -140,6 +142,7 @@ TRAIN_FOLDER = command(parsers.parse_folder, "train", "train_folder")
 VERBS = {
     "resume": command(parsers.parse_resume, "train", "resume"),
     "eval": command(parsers.parse_eval, "runs", "evaluate"),
+    "judge": command(parse_methods, "judge", "compare"),
     "photographs": command(parsers.parse_photographs, "runs", "check_photographs"),
     "render": command(parsers.parse_render, "runs", "render"),
     "view": command(parsers.parse_view, "runs", "view"),

@@ -15,7 +15,7 @@ from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError
 from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.core.training.run import Run
-from gsx.experiments.evaluation.competitor import Competitor, competitor_for
+from gsx.experiments.evaluation.competitor import Competitor, competitor_for, context_of
 from gsx.experiments.evaluation.detail import Detail, Details
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluator import Evaluator
@@ -75,7 +75,7 @@ def run(tmp_path: Path) -> Run:
 def test_a_zoom_is_compared_with_what_an_upscaler_makes_of_the_x1_render(run: Run) -> None:
     """x1 shows 100 and 60 of 104 and 71; the guess is 103 and 63, the render 110 and 70."""
     guess = Guess()
-    found = evaluation_of(run, competitor_for(run, "guess", lambda: guess, ZOOMS))
+    found = evaluation_of(run, competitor_for(run.scene, "guess", lambda: guess, ZOOMS, context_of(run, "guess")))
     entry = found["zoom"]["2"]
     assert entry["upscaled_psnr"] == close(decibels(1, 8))
     assert (entry["psnr"], entry["enlarged_psnr"]) == (close(decibels(6, 1)), close(decibels(4, 11)))
@@ -87,7 +87,7 @@ def test_a_zoom_is_compared_with_what_an_upscaler_makes_of_the_x1_render(run: Ru
 
 def test_it_sees_the_x1_render_and_learns_from_training_views_alone(run: Run) -> None:
     guess = Guess()
-    evaluation_of(run, competitor_for(run, "guess", lambda: guess, ZOOMS))
+    evaluation_of(run, competitor_for(run.scene, "guess", lambda: guess, ZOOMS, context_of(run, "guess")))
     [context] = guess.contexts
     assert list(context.views) == list(run.train_views)
     assert [request.view.name for request in guess.requests] == ["a", "b"]  # c has no truth at x2
@@ -98,14 +98,18 @@ def test_it_sees_the_x1_render_and_learns_from_training_views_alone(run: Run) ->
 
 
 def test_the_oracle_meets_the_truth_pixel_by_pixel(run: Run) -> None:
-    competitor = competitor_for(run, "oracle", lambda: Oracle(PlainOptions(name="oracle")), ZOOMS)
+    competitor = competitor_for(
+        run.scene, "oracle", lambda: Oracle(PlainOptions(name="oracle")), ZOOMS, context_of(run, "oracle")
+    )
     entry = evaluation_of(run, competitor)["zoom"]["2"]
     assert entry["upscaled_psnr"] == float("inf")
     assert entry["beats_upscaled"] is False
 
 
 def test_lanczos_leaves_a_flat_picture_flat(run: Run) -> None:
-    competitor = competitor_for(run, "lanczos", lambda: Resampled(PlainOptions(name="lanczos")), ZOOMS)
+    competitor = competitor_for(
+        run.scene, "lanczos", lambda: Resampled(PlainOptions(name="lanczos")), ZOOMS, context_of(run, "lanczos")
+    )
     entry = evaluation_of(run, competitor)["zoom"]["2"]
     assert entry["upscaled_psnr"] == close(entry["enlarged_psnr"])
 
@@ -114,7 +118,7 @@ def test_zooms_out_of_reach_are_logged_once_and_left_out(run: Run, caplog: pytes
     """No view has a truth at x8, and x1.5 is no whole factor: both are no matter of the upscaler."""
     guess = Guess(reached=[3, 4])
     with caplog.at_level(logging.INFO):
-        competitor = competitor_for(run, "guess", lambda: guess, [*ZOOMS, 4.0])
+        competitor = competitor_for(run.scene, "guess", lambda: guess, [*ZOOMS, 4.0], context_of(run, "guess"))
     assert competitor is not None
     assert competitor.scales == {4}
     assert [record.message for record in caplog.records] == [
@@ -130,7 +134,7 @@ def test_a_missing_package_leaves_the_figures_out_and_logs_the_remedy(
         raise ConfigError(REMEDY)
 
     with caplog.at_level(logging.INFO):
-        assert competitor_for(run, "span", absent, [1.0, 2.0, 4.0]) is None
+        assert competitor_for(run.scene, "span", absent, [1.0, 2.0, 4.0], context_of(run, "span")) is None
     assert [record.message for record in caplog.records] == [
         f"no upscaled x1 render to compare with at x2, x4: {REMEDY}"
     ]
@@ -144,13 +148,13 @@ def test_an_upscaler_that_cannot_learn_leaves_the_figures_out(run: Run, caplog: 
             raise RuntimeError("out of memory")
 
     with caplog.at_level(logging.INFO):
-        assert competitor_for(run, "guess", Poor, [2.0]) is None
+        assert competitor_for(run.scene, "guess", Poor, [2.0], context_of(run, "guess")) is None
     assert "no upscaled x1 render to compare with at x2: out of memory" in caplog.text
 
 
 def test_a_run_that_was_stopped_in_its_last_step_is_evaluated(run: Run) -> None:
     guess, run.progress.stopping = Guess(), True
-    competitor_for(run, "guess", lambda: guess, ZOOMS)
+    competitor_for(run.scene, "guess", lambda: guess, ZOOMS, context_of(run, "guess"))
     guess.contexts[0].raise_if_stopping()
 
 
@@ -158,7 +162,7 @@ def test_without_a_zoom_nothing_is_built(run: Run) -> None:
     def unused() -> Guess:
         raise AssertionError
 
-    assert competitor_for(run, "guess", unused, [1.0, 0.5, 1.5]) is None
+    assert competitor_for(run.scene, "guess", unused, [1.0, 0.5, 1.5], context_of(run, "guess")) is None
 
 
 @pytest.mark.parametrize(
@@ -172,7 +176,7 @@ def test_without_a_zoom_nothing_is_built(run: Run) -> None:
 def test_a_failure_leaves_out_the_zoom_for_all_views(
     run: Run, caplog: pytest.LogCaptureFixture, faulty: Callable[[Request], Tensor], words: str
 ) -> None:
-    competitor = competitor_for(run, "guess", lambda: Guess(faulty=faulty), ZOOMS)
+    competitor = competitor_for(run.scene, "guess", lambda: Guess(faulty=faulty), ZOOMS, context_of(run, "guess"))
     entry = evaluation_of(run, competitor)["zoom"]["2"]
     assert not {key for key in entry if "upscaled" in key}
     assert entry["psnr"] == close(decibels(6, 1))
@@ -180,7 +184,7 @@ def test_a_failure_leaves_out_the_zoom_for_all_views(
 
 
 def test_results_beyond_the_range_are_clamped(run: Run) -> None:
-    competitor = competitor_for(run, "guess", lambda: Guess(levels=300), ZOOMS)
+    competitor = competitor_for(run.scene, "guess", lambda: Guess(levels=300), ZOOMS, context_of(run, "guess"))
     assert competitor is not None
     result = competitor.enlarge(torch.full((3, 4, 6), 0.5), run.scene.test[0], 2)
     assert result is not None

@@ -30,7 +30,7 @@ from gsx.core.training.run import Progress, Run, TrainingOptions
 from gsx.core.training.sampler import Sampler
 from gsx.core.training.training_views import TrainingViews
 from gsx.experiments.evaluation import evaluated_renders
-from gsx.experiments.evaluation.competitor import competitor_for
+from gsx.experiments.evaluation.competitor import competitor_for, context_of
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.lpips import LpipsOptions
@@ -244,7 +244,9 @@ def test_crops_show_what_an_upscaler_makes_of_the_x1_render(tmp_path: Path) -> N
     """Lanczos' filter with three lobes, and PIL's."""
     run = make_run(tmp_path, views=1)
     options = replace(OPTIONS, zoom=[2], pairs=0)
-    competitor = competitor_for(run, "lanczos", lambda: Resampled(PlainOptions(name="lanczos")), options.zoom)
+    competitor = competitor_for(
+        run.scene, "lanczos", lambda: Resampled(PlainOptions(name="lanczos")), options.zoom, context_of(run, "lanczos")
+    )
     drawing = Pictures(run.folder / "renders", run.step)
     Evaluator(run, options, competitor).evaluate(drawing)
     drawing.write_index()

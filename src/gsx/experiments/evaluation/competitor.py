@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.data.masks import black_out
-from gsx.core.data.scene import View
+from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError, TrainingError, first_line
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import Checkable, HasProvenance, Regenerator, RegeneratorContext, Request
@@ -30,15 +30,17 @@ FAILURES = (*REFUSALS, TrainingError, RuntimeError, MemoryError)
 class Competitor:
     """A regenerator that enlarges the x1 renders of held-out views, at the integer zooms that it reaches."""
 
-    def __init__(self, run: Run, name: str, regenerator: Regenerator, scales: Sequence[int]) -> None:
-        self.run, self.name, self.regenerator, self.scales = run, name, regenerator, set(scales)
+    def __init__(self, scene: Scene, name: str, regenerator: Regenerator, scales: Sequence[int], step: int = 0) -> None:
+        self.scene, self.name, self.regenerator, self.scales = scene, name, regenerator, set(scales)
+        self.step = step
+        """Step of the run whose renders are enlarged; 0: they are of no run."""
 
     def enlarge(self, image: Float[Tensor, "3 h w"], view: View, factor: float) -> Float[Tensor, "3 H W"] | None:
         """Returns a view's x1 render, enlarged; None: the upscaler does not reach that zoom, or has failed there."""
         if factor not in self.scales:
             return None
         try:
-            return self.result(request_of(self.run, image, view, int(factor)))
+            return self.result(request_of(self.scene, image, view, int(factor), self.step))
         except Exception as error:  # of any library or function: the model's own figures are kept
             message = "eval.competitor: %s fails at x%g, where its figures are left out (%s)"
             logger.warning(message, self.name, factor, first_line(error))
@@ -74,51 +76,53 @@ class Competitor:
         return {"name": self.name, **model}
 
 
-def request_of(run: Run, image: Float[Tensor, "3 h w"], view: View, scale: int) -> Request:
+def request_of(scene: Scene, image: Float[Tensor, "3 h w"], view: View, scale: int, step: int) -> Request:
     """Returns the request to enlarge a view's x1 render."""
     return Request(
         image=image.clone(),  # a regenerator may write into its picture
         scale=scale,
-        reduction=run.scene.reduction,
+        reduction=scene.reduction,
         camera=view.camera,
         view=view,
-        number=next((number for number, one in enumerate(run.train_views) if one.name == view.name), 0),
+        number=next((number for number, one in enumerate(scene.train) if one.name == view.name), 0),
         photo=False,
         seed=0,
         strength=1.0,
         strongest=1.0,
         prompt="",
-        step=run.step,
+        step=step,
     )
 
 
-def competitor_for(run: Run, name: str, make: Callable[[], Regenerator], zooms: Sequence[float]) -> Competitor | None:
+def competitor_for(
+    scene: Scene, name: str, make: Callable[[], Regenerator], zooms: Sequence[float], context: RegeneratorContext
+) -> Competitor | None:
     """Builds and prepares the competitor for the integer zooms above 1; None if it reaches none of them.
 
     Logs why zooms are not reached, with the remedy: a missing package, or factors that the model does not have.
     """
     scales = [int(zoom) for zoom in zooms if zoom > 1 and zoom == int(zoom)]
-    scales = [scale for scale in scales if views_with_truth(run, scale)]
+    scales = [scale for scale in scales if views_with_truth(scene, scale)]
     if not scales:
         return None
     try:
         regenerator = make()
-        reached = list(reached_scales(run, regenerator, scales))
+        reached = list(reached_scales(scene, regenerator, scales))
         if reached:
-            regenerator.prepare(context_of(run, name))
+            regenerator.prepare(context)
     except FAILURES as error:
         log_absent(scales, str(error))
         return None
-    return Competitor(run, name, regenerator, reached) if reached else None
+    return Competitor(scene, name, regenerator, reached, context.step) if reached else None
 
 
-def reached_scales(run: Run, regenerator: Regenerator, scales: Sequence[int]) -> Iterator[int]:
+def reached_scales(scene: Scene, regenerator: Regenerator, scales: Sequence[int]) -> Iterator[int]:
     """Yields the scales that a regenerator reaches; logs each reason why it does not reach others, once."""
     reasons: dict[str, list[int]] = {}
     for scale in scales:
         try:
             if isinstance(regenerator, Checkable):
-                regenerator.check(views_with_truth(run, scale), [scale], False)
+                regenerator.check(views_with_truth(scene, scale), [scale], False)
             yield scale
         except REFUSALS as error:
             reasons.setdefault(str(error), []).append(scale)
@@ -132,9 +136,9 @@ def log_absent(scales: Sequence[int], reason: str) -> None:
     logger.info("no upscaled x1 render to compare with at %s: %s", listed, reason)
 
 
-def views_with_truth(run: Run, scale: int) -> list[View]:
+def views_with_truth(scene: Scene, scale: int) -> list[View]:
     """Returns the held-out views with a photo at that zoom."""
-    return [view for view in run.scene.test if view.zoom(scale) is not None]
+    return [view for view in scene.test if view.zoom(scale) is not None]
 
 
 def context_of(run: Run, name: str) -> RegeneratorContext:
@@ -143,19 +147,25 @@ def context_of(run: Run, name: str) -> RegeneratorContext:
     It does not end with training: a run that is complete is evaluated, also after a signal in its last step.
     """
 
+    return RegeneratorContext(
+        views=run.train_views,
+        reduction=run.scene.reduction,
+        render=lambda camera: render(run, camera).image,
+        held_out=refuse_learning(name),
+        step=run.step,
+        seed=0,
+        device=run.device,
+        folder=run.folder / "regenerators" / "competitor",
+    )
+
+
+def refuse_learning(name: str) -> Callable[[float], list[Float[Tensor, "3 h w"]]]:
+    """Returns a stand-in for renders of other models, which an evaluation does not train; it raises ConfigError."""
+
     def held_out(share: float) -> list[Float[Tensor, "3 h w"]]:
         raise ConfigError(
             f"{name} learns from renders of other models, which an evaluation does not train: choose another upscaler, "
             "regenerator/upscale@eval.competitor=lanczos"
         )
 
-    return RegeneratorContext(
-        views=run.train_views,
-        reduction=run.scene.reduction,
-        render=lambda camera: render(run, camera).image,
-        held_out=held_out,
-        step=run.step,
-        seed=0,
-        device=run.device,
-        folder=run.folder / "regenerators" / "competitor",
-    )
+    return held_out

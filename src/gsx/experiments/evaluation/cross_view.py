@@ -5,7 +5,7 @@ that is invented for each picture does not. A blurred picture agrees as well, so
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -16,17 +16,17 @@ from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.quality.metrics import decibel
 from gsx.core.shapes import Float, Int
-from gsx.core.training.run import Run
 from gsx.experiments.evaluation.chosen_views import evenly, neighbour
 from gsx.experiments.evaluation.eval_options import EvalOptions
-from gsx.experiments.evaluation.evaluated_renders import EvaluatedRenders, depth_and_coverage
-from gsx.experiments.evaluation.warp import Surface, places_in, surface_of, warped
+from gsx.experiments.evaluation.warp import Surface, places_in, warped
 from gsx.experiments.evaluation.zoomed import Zoomed
 
 COMPARED = ("render", "enlarged", "upscaled", "truth")
 """Pictures of a zoomed view whose consistency is measured."""
 Zoom: TypeAlias = Callable[[View, float], Zoomed | None]
 """Returns a view at a zoom; None: it has no truth there."""
+SurfaceOf: TypeAlias = Callable[[Zoomed], Surface]
+"""Returns what is visible in a zoomed view, by the depth of a model."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -158,8 +158,12 @@ class CrossViews:
     A held-out view that waits for its neighbour is kept; a neighbour of training is rendered when its turn has come.
     """
 
-    def __init__(self, run: Run, options: EvalOptions, renders: EvaluatedRenders, zoom: Zoom) -> None:
-        self.run, self.options, self.renders, self.zoom = run, options, renders, zoom
+    def __init__(
+        self, test: Sequence[View], train: Sequence[View], options: EvalOptions, surface: SurfaceOf, zoom: Zoom
+    ) -> None:
+        """Chooses pairs of held-out views with neighbours among them and the training views."""
+        self.test, self.train = test, [] if options.right_halves else train  # whose right halves may be masked
+        self.options, self.surface, self.zoom = options, surface, zoom
         self.pairs = {factor: self.choose(factor) for factor in options.zoom if factor > 1}
         """Pairs of (held-out view, neighbour) that are not compared yet, by zoom."""
         self.kept: dict[float, dict[View, SurfaceView]] = {factor: {} for factor in self.pairs}
@@ -167,9 +171,8 @@ class CrossViews:
 
     def choose(self, factor: float) -> list[tuple[View, View]]:
         """Returns up to `eval.pairs` held-out views with their neighbours; all have a truth at that zoom."""
-        test = [view for view in self.run.scene.test if view.zoom(factor) is not None]
-        train = [] if self.options.right_halves else self.run.train_views  # whose right halves may be masked
-        others = [*test, *(view for view in train if view.zoom(factor) is not None)]
+        test, train = ([v for v in views if v.zoom(factor) is not None] for views in (self.test, self.train))
+        others = [*test, *train]
         chosen, cameras = evenly(test, self.options.pairs), [view.camera for view in others]
         near = [neighbour(view.camera, cameras) for view in chosen]
         return [(view, others[index]) for view, index in zip(chosen, near, strict=True) if index is not None]
@@ -190,7 +193,7 @@ class CrossViews:
 
     def trained(self, view: View) -> bool:
         """Returns whether a view is none of those held out."""
-        return view not in self.run.scene.test
+        return view not in self.test
 
     def neighbour_view(self, view: View, factor: float) -> SurfaceView:
         """Renders a training view."""
@@ -199,19 +202,15 @@ class CrossViews:
         return self.surface_view(zoomed, view)
 
     def surface_view(self, zoomed: Zoomed, view: View) -> SurfaceView:
-        """Renders the depth of a zoomed view."""
-        camera = self.renders.camera(zoomed.view)
-        depth, alpha = depth_and_coverage(self.run, camera, self.options.tile_pixels)
-        mask = zoomed.view.counted()
-        surface = surface_of(camera, depth, alpha, mask if zoomed.counted is None else zoomed.counted)
+        """Returns a zoomed view with what is visible in it."""
         pictures: dict[str, Tensor] = zoomed.pictures(COMPARED)
         if self.options.quantise:
             pictures = {name: to_uint8(picture) for name, picture in pictures.items()}
         return SurfaceView(
-            surface=surface,
+            surface=self.surface(zoomed),
             stored=pictures,
             size=(view.camera.height, view.camera.width),
-            masked=mask is not None,
+            masked=zoomed.view.counted() is not None,
         )
 
     def figures(self, factor: float) -> dict[str, dict[str, object]]:

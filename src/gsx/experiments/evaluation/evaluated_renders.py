@@ -16,6 +16,8 @@ from gsx.core.training.backbone import behind_scene
 from gsx.core.training.render import coverage_and_depth, render, splats_for
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.warp import Surface, surface_of
+from gsx.experiments.evaluation.zoomed import Zoomed
 from gsx.modules.alignment import estimate_camera
 
 ALIGNMENTS = 2
@@ -49,6 +51,13 @@ class EvaluatedRenders:
         if factor < 1 and not times and trained > 1:
             times = math.ceil(trained / factor)
         return render(self.run, self.camera(view), self.options.tile_pixels, times)
+
+    def surface(self, zoomed: Zoomed) -> Surface:
+        """Renders what is visible in a zoomed view."""
+        camera = self.camera(zoomed.view)
+        depth, alpha = depth_and_coverage(self.run, camera, self.options.tile_pixels)
+        counted = zoomed.view.counted() if zoomed.counted is None else zoomed.counted
+        return surface_of(camera, depth, alpha, counted)
 
     def fit(self, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
         """Returns a render of a view in the colours that are compared; call it at the photos' resolution first."""

@@ -178,7 +178,8 @@ class Evaluator:
         if not views:
             return {f"{factor:g}": {"unavailable": NOT_MEASURED} for factor in self.options.zoom}
         found: dict[float, list[ZoomFigures]] = {factor: [] for factor in self.options.zoom}
-        cross = CrossViews(self.run, self.options, self.renders, self.zoomed)
+        run = self.run
+        cross = CrossViews(run.scene.test, run.train_views, self.options, self.renders.surface, self.zoomed)
         for number, (view, own) in enumerate(zip(self.run.scene.test, views, strict=True)):
             if drawing is not None:
                 drawing.whole(number, view, self.whole(view))

@@ -13,7 +13,7 @@ from gsx.core.files import write_json
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.experiments.evaluation.competitor import Competitor, competitor_for
+from gsx.experiments.evaluation.competitor import Competitor, competitor_for, context_of
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluator import Evaluator
 from gsx.experiments.evaluation.perceptual import COMPARED
@@ -85,8 +85,9 @@ def competitor_of(run: Run, settings: Settings) -> Competitor | None:
     """Return the upscaler of x1 renders for the evaluated zooms; None: there is none, or it reaches none of them."""
     if (chosen := settings.competitor) is None:
         return None
-    component = chosen.component
-    return competitor_for(run, component.name, lambda: component.factory(chosen.options), settings.evaluation.zoom)
+    component, zooms = chosen.component, settings.evaluation.zoom
+    context = context_of(run, component.name)
+    return competitor_for(run.scene, component.name, lambda: component.factory(chosen.options), zooms, context)
 
 
 def add_depth_and_flight(run: Run, pictures: Pictures, options: EvalOptions) -> None:

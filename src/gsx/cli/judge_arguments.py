@@ -1,0 +1,106 @@
+"""Parser of `gsx judge`."""
+
+import argparse
+from pathlib import Path
+
+from gsx.cli.arguments import Parser
+from gsx.core.errors import ConfigError, InputError
+from gsx.core.files import expand_home
+from gsx.experiments.runs.overrides import is_override, key_of
+
+SETTINGS = (
+    *("scene", "dataset", "data_root", "protocol", "eval", "metrics", "device", "seed", "axes"),
+    *("rasterizer", "regenerator/upscale@eval.competitor"),
+)
+"""Settings of scene and figures; other words NAME=PATH are methods."""
+SCENE = ("scene=", "dataset=")
+"""Settings that choose a scene."""
+
+
+def parse_methods(arguments: list[str]) -> argparse.Namespace:
+    """Parse `gsx judge METHOD=PATH ... FOLDER|PREPARED ... [KEY=VALUE ...] [options]`."""
+    description = (
+        "Measure pictures or splats of any program on the test views of a scene, next to each other. PATH is a folder "
+        "of rendered pictures, a splat file, or a run folder. For example: gsx judge ours=renders theirs=model.ply "
+        "FOLDER scene.downscale=4. In PATH, {scene} stands for the name of each prepared scene; a METHOD that is named "
+        "again is another repetition of it, such as another seed."
+    )
+    parser = Parser("judge", description, "METHOD=PATH ... FOLDER|PREPARED ... [KEY=VALUE ...] [options]")
+    parser.settings = True
+    words = "methods, the folder of the scene or folders of gsx prepare, and settings"
+    parser.add_argument("words", nargs="*", default=[], metavar="METHOD=PATH|FOLDER|KEY=VALUE", help=words)
+    parser.add_argument("--to", type=Path, metavar="FOLDER", help="new folder for the page (outputs/comparisons/TIME)")
+    against = "method that the others are compared with (the first)"
+    parser.add_argument("--against", default="", metavar="METHOD", help=against)
+    protocols = "measure by each of these protocols: names of conf/protocol, by commas"
+    parser.add_argument("--protocols", type=names, default=[], metavar="A,B", help=protocols)
+    order = "list of the views that numbered pictures show, one a line, or a camera file"
+    parser.add_argument("--order", type=Path, metavar="FILE", help=order)
+    depth = "run or splat file by whose depth the consistency of pictures is measured"
+    parser.add_argument("--depth", type=Path, metavar="RUN|FILE", help=depth)
+    partial = "measure the test views that all methods have, if some lack pictures"
+    parser.add_argument("--partial", action="store_true", help=partial)
+    options = parser.parse_intermixed_args(arguments)
+    options.line = arguments
+    options.methods, options.folders, options.overrides = sorted_words(options.words)
+    refuse_absent(options)
+    return options
+
+
+def names(word: str) -> list[str]:
+    """Split names at commas."""
+    return [name for name in word.split(",") if name]
+
+
+def sorted_words(words: list[str]) -> tuple[list[tuple[str, Path]], list[Path], list[str]]:
+    """Return methods with their paths, folders, and settings.
+
+    Raises:
+        ConfigError, InputError: a word is none of these, or a path does not exist.
+    """
+    methods, folders, overrides = list[tuple[str, Path]](), list[Path](), list[str]()
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals:
+            folders.append(existing_folder(word))
+        elif is_setting(word):
+            overrides.append(word)
+        else:
+            methods.append((name, existing_path(name, value)))
+    if not methods:
+        raise ConfigError("gsx judge needs at least one method: give NAME=PATH, for example ours=renders")
+    return methods, folders, overrides
+
+
+def is_setting(word: str) -> bool:
+    """Return whether a word sets the scene or how figures are measured."""
+    key = key_of(word)
+    return is_override(word) and (key in SETTINGS or key.partition(".")[0] in SETTINGS)
+
+
+def existing_folder(word: str) -> Path:
+    """Return the folder of a scene; raise InputError if there is none."""
+    folder = expand_home(word)
+    if not folder.is_dir():
+        raise InputError(f"gsx judge: '{word}' is neither NAME=PATH, nor KEY=VALUE, nor a folder: check its name")
+    return folder
+
+
+def existing_path(name: str, word: str) -> Path:
+    """Return the path of a method; raise if it does not exist: with {scene} it is checked for each scene."""
+    path = expand_home(word)
+    if not name or not word:
+        raise ConfigError(f"gsx judge: '{name}={word}' names no method and path: write NAME=PATH")
+    if "{scene}" not in word and not path.exists():
+        raise InputError(
+            f"gsx judge: '{name}={word}': there is no such file or folder, and gsx judge has no setting '{name}'"
+        )
+    return path
+
+
+def refuse_absent(options: argparse.Namespace) -> None:
+    """Raise InputError for files of options that do not exist."""
+    for flag in ("order", "depth"):
+        path = getattr(options, flag)
+        if path is not None and not path.exists():
+            raise InputError(f"gsx judge: --{flag} {path} does not exist: check its name")

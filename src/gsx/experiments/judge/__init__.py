@@ -1,0 +1,1 @@
+"""Pictures and splats of any program, measured by one protocol."""

@@ -1,0 +1,196 @@
+"""Measures pictures and splats of any program on some scenes by some protocols: `gsx judge`."""
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from gsx import __version__
+from gsx.core.errors import ConfigError, InputError, command
+from gsx.core.files import read_json, replace_text, write_json
+from gsx.core.plugins import Plugins
+from gsx.engine.cache import source_revision
+from gsx.experiments.judge.methods import Entry
+from gsx.experiments.judge.page import page_of
+from gsx.experiments.judge.scene_figures import Choices, Subject, measure_scene
+from gsx.experiments.judge.summary import PLACE, baseline_of, named_methods, over_scenes, rows_of, view_rows
+from gsx.experiments.judge.tables import as_csv, as_text
+from gsx.experiments.prepare.whole_folder import MANIFEST, whole_folder
+from gsx.experiments.runs.compose import Compositions
+
+logger = logging.getLogger(__name__)
+
+FORMAT = 1
+"""Version of comparison.json."""
+PAGE, RESULTS, FIGURES, VIEWS, PICTURES = "comparison.html", "comparison.json", "figures.csv", "views.csv", "pictures"
+CACHE = "scene.cache_gb=0.5"
+"""Each photo is read once at each size: a larger cache gains nothing."""
+
+
+def compare_methods(
+    entries: Sequence[Entry],
+    subjects: Sequence[Subject],
+    choices: Choices,
+    protocols: Sequence[str],
+    against: str,
+    to: Path | None,
+    plugins: Plugins,
+    words: Sequence[str],
+) -> tuple[Path, list[str]]:
+    """Measures methods on scenes; returns the page, and the table in lines.
+
+    Args:
+        entries: Methods; equal names are repetitions.
+        subjects: Scenes.
+        choices: Further options.
+        protocols: Names of conf/protocol, in turn; empty: the settings as they are.
+        against: Method that others are compared with; empty: the first.
+        to: New folder; None: one below `outputs/comparisons`, named by the time.
+        plugins: Loaded components.
+        words: The command line, for the page.
+
+    Raises:
+        ConfigError, InputError: a setting, a scene or a method cannot be measured; nothing is written.
+    """
+    entries = numbered(entries)
+    refuse_unknown_baseline(against, entries)
+    refuse_equal_names(subjects)
+    place = Path("outputs") / "comparisons" / f"{datetime.now():%Y-%m-%d_%H-%M-%S}" if to is None else to
+    refuse_full(place)
+    with whole_folder(place) as folder:
+        (folder / PICTURES).mkdir()
+        results = []
+        for number, (subject, name) in enumerate((s, p) for s in subjects for p in protocols or [""]):
+            measured = with_protocol(subject, name, plugins)
+            found = measure_scene(measured, entries, choices, plugins, folder / PICTURES, f"{number}")
+            results.append({"protocol_name": name, **found})
+        baseline = baseline_of(results, against)
+        lines = write_results(folder, results, baseline, words)
+    return place / PAGE, lines
+
+
+def numbered(entries: Sequence[Entry]) -> list[Entry]:
+    """Returns methods with repetitions of one name counted."""
+    counts: dict[str, int] = {}
+    out = []
+    for entry in entries:
+        out.append(replace(entry, repetition=counts.get(entry.name, 0)))
+        counts[entry.name] = counts.get(entry.name, 0) + 1
+    return out
+
+
+def refuse_unknown_baseline(against: str, entries: Sequence[Entry]) -> None:
+    """Raises InputError for --against with a name of no method."""
+    baseline_of([{"methods": [{"name": entry.name} for entry in entries]}], against)
+
+
+def refuse_equal_names(subjects: Sequence[Subject]) -> None:
+    """Raises InputError if two prepared scenes have one name."""
+    names = [subject.name for subject in subjects]
+    if twice := next((name for name in names if name and names.count(name) > 1), ""):
+        raise InputError(f"two of the prepared folders hold a scene called '{twice}': compare them one by one")
+
+
+def refuse_full(place: Path) -> None:
+    """Raises InputError for a place that is not free."""
+    if place.is_dir() and any(place.iterdir()):
+        raise InputError(f"--to {place} holds other files: choose a new folder")
+    if place.exists() and not place.is_dir():
+        raise InputError(f"--to {place} is a file: choose a new folder")
+
+
+def with_protocol(subject: Subject, protocol: str, plugins: Plugins) -> Subject:
+    """Returns a scene that a named protocol measures, with a small cache; empty: by the settings as they are.
+
+    Its settings of sizes and splits do not count: pictures have their size, and the scene its test views.
+
+    Raises:
+        ConfigError: there is no such protocol.
+    """
+    measuring = [] if not protocol else measuring_words(subject.overrides, protocol, plugins)
+    return replace(subject, overrides=(*with_small_cache(subject.overrides), *measuring))
+
+
+def with_small_cache(overrides: Sequence[str]) -> list[str]:
+    """Returns settings with a small cache of photos, unless they set one or the scene has none."""
+    of_photos = any(word.startswith("scene.path=") for word in overrides)
+    chosen = any(word.startswith("scene.cache_gb=") for word in overrides)
+    return [*overrides, *([CACHE] if of_photos and not chosen else [])]
+
+
+def measuring_words(overrides: Sequence[str], protocol: str, plugins: Plugins) -> list[str]:
+    """Returns the settings by which a protocol measures, as far as the scene has them."""
+    with Compositions(plugins) as compositions:
+        measuring, known = compositions.protocol(protocol).measuring, compositions.keys(overrides)
+    fitting = {key: value for key, value in measuring.items() if key in known and key != "eval.zoom"}
+    return [f"{key}={json.dumps(value)}" for key, value in fitting.items()]
+
+
+def prepared_subject(folder: Path, overrides: Sequence[str]) -> Subject:
+    """Reads the manifest of a folder that `gsx prepare` wrote; `overrides`: further settings.
+
+    Raises:
+        InputError: it is unreadable.
+    """
+    file = folder / MANIFEST
+    try:
+        manifest: dict[str, Any] = read_json(file)
+        return Subject(
+            overrides=(*map(str, manifest["overrides"]), *overrides),
+            own=len(manifest["overrides"]),
+            name=str(manifest["scene"]),
+            prepared_zooms=tuple(map(float, manifest["zooms"])),
+            aliases={str(view["name"]): str(view["file"]) for view in manifest["test"]},
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"'{file}' cannot be read ({error}): prepare the scene again by gsx prepare") from None
+
+
+def subjects_of(folders: Sequence[Path], words: Sequence[str], overrides: Sequence[str]) -> list[Subject]:
+    """Returns the scenes to measure: those of prepared folders, or the one of settings.
+
+    words: settings that choose a scene; empty: none do.
+
+    Raises:
+        ConfigError: there is no scene, or prepared folders and another one.
+    """
+    if folders and words:
+        raise ConfigError(
+            f"gsx judge: '{words[0]}' does not go with a prepared folder, which has a scene: leave it out"
+        )
+    if folders:
+        return [prepared_subject(folder, overrides) for folder in folders]
+    if not words:
+        raise ConfigError(
+            "gsx judge needs the scene that the pictures show: give its FOLDER, a folder of gsx prepare, or scene=NAME"
+        )
+    return [Subject(overrides=(*words, *overrides))]
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def write_results(folder: Path, results: Sequence[Mapping[str, Any]], baseline: str, words: Sequence[str]) -> list[str]:
+    """Writes JSON, CSV and page; returns the table in lines."""
+    rows = rows_of(results, baseline)
+    means = over_scenes(rows, baseline)
+    content = {
+        "format": FORMAT,
+        "gsx": __version__,
+        "revision": source_revision(),
+        "date": f"{datetime.now():%Y-%m-%d %H:%M}",
+        "command": command("judge", *words),
+        "methods": named_methods(results),
+        "against": baseline,
+        "rows": rows,
+        "means": means,
+        "results": results,
+    }
+    write_json(folder / RESULTS, content)
+    replace_text(folder / FIGURES, as_csv([*rows, *means], PLACE))
+    replace_text(folder / VIEWS, as_csv([*view_rows(results)], (*PLACE, "repetition", "view")))
+    replace_text(folder / PAGE, page_of(content, rows, means))
+    return as_text([*rows, *means], baseline)

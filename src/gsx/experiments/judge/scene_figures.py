@@ -1,0 +1,265 @@
+"""Methods on one scene, measured by one protocol."""
+
+import logging
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from gsx.core.data.scene import Scene, View
+from gsx.core.errors import ConfigError, InputError
+from gsx.core.plugins import Plugins
+from gsx.core.training.regenerator import RegeneratorContext
+from gsx.experiments.evaluation.competitor import Competitor, competitor_for, refuse_learning
+from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.lpips import load_lpips
+from gsx.experiments.evaluation.perceptual import MetricSettings, load_metrics
+from gsx.experiments.evaluation.protocol import protocol_of
+from gsx.experiments.judge.crops import Crops
+from gsx.experiments.judge.matching import Matcher
+from gsx.experiments.judge.measure import Measured, Measurement, Protocol, own_truth_psnr
+from gsx.experiments.judge.methods import Entry, Method, Model, PictureFolder
+from gsx.experiments.judge.models import is_model, opened_model
+from gsx.experiments.judge.view_names import bare, names_of_views, read_order
+from gsx.experiments.runs.build import choose_device, prepare_process
+from gsx.experiments.runs.compose import compose
+from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.progress import Countdown
+from gsx.experiments.runs.settings import Settings
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subject:
+    """A scene, by the settings that choose it."""
+
+    overrides: tuple[str, ...]
+    own: int = 0
+    """Number of leading overrides that are of a prepared folder."""
+    name: str = ""
+    """Replaces `{scene}` in paths; empty: the scene's own."""
+    prepared_zooms: tuple[float, ...] = ()
+    """Zooms for which a scene was prepared; models are measured at them unless pictures have others."""
+    aliases: Mapping[str, str] | None = None
+    """Names of pictures by view, as `gsx prepare` lists them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choices:
+    """Options beyond settings."""
+
+    order: Path | None = None
+    """List of the views of numbered pictures."""
+    depth: Path | None = None
+    """Run or splat file whose depth says what pictures of files show."""
+    partial: bool = False
+    """True: measure the views that all methods have."""
+
+
+def measure_scene(
+    subject: Subject, entries: Sequence[Entry], choices: Choices, plugins: Plugins, folder: Path, stem: str
+) -> dict[str, Any]:
+    """Measures methods on a scene and writes crops into a folder; returns the results.
+
+    stem: begins the names of crops.
+
+    Raises:
+        ConfigError, InputError: a setting, the scene or a method cannot be measured.
+    """
+    settings = compose(subject.overrides, plugins)
+    refuse_halves(settings.evaluation)
+    prepare_process(choose_device(settings.general.device), training=False)
+    scene = load_scene(settings)
+    refuse_without_test_views(scene)
+    methods = methods_of(subject, entries, choices, settings, plugins, scene)
+    zooms = zooms_of(subject, methods, settings.evaluation.zoom)
+    scene = with_shared_views(scene, methods, zooms) if choices.partial else scene
+    for method in methods:
+        log_notes(method, zooms, scene)
+    with tempfile.TemporaryDirectory() as work:
+        how = protocol_for(settings, scene, zooms, Path(work))
+        measurement, crops = Measurement(scene, how, methods, zooms), Crops(folder, scene, stem)
+        logger.info("measuring %d test views of %s at %s", len(scene.test), scene.name, listed(zooms))
+        found = measurement.run(crops.receive, Countdown("measuring", measurement.work()).advance)
+    return {
+        "scene": scene.name,
+        "named": subject.name or scene.name,
+        "settings": list(subject.overrides),
+        "protocol": protocol_of(scene, settings.evaluation, how.lpips.name if how.lpips else "n/a (no weights)"),
+        **how.perceptual.provenance,
+        **({"competitor": how.competitor.provenance()} if how.competitor else {}),
+        "methods": [result_of(one, scene) for one in found],
+        "pictures": crops.index(),
+    }
+
+
+def refuse_halves(options: EvalOptions) -> None:
+    """Raises ConfigError for settings that need a model."""
+    if options.right_halves:
+        raise ConfigError(
+            f"gsx judge compares pictures as they are: leave out eval.colours={options.colours} eval.poses="
+            f"{options.poses}, which `gsx eval` has"
+        )
+
+
+def refuse_without_test_views(scene: Scene) -> None:
+    """Raises ConfigError if no view is held out."""
+    if not scene.test:
+        raise ConfigError("gsx judge compares with test views: choose another split than scene.split=none")
+
+
+# -- methods -----------------------------------------------------------------------------------------------------------
+
+
+def methods_of(
+    subject: Subject,
+    entries: Sequence[Entry],
+    choices: Choices,
+    settings: Settings,
+    plugins: Plugins,
+    scene: Scene,
+) -> list[Method]:
+    """Opens models and matches pictures with views, by words METHOD=PATH."""
+    own = [replace(one, path=place_for(one.path, subject.name or scene.name)) for one in entries]
+
+    def model(entry: Entry) -> Model:
+        return opened_model(entry, subject.overrides, settings, plugins, scene)
+
+    depth = model(Entry(name="--depth", path=choices.depth)) if choices.depth else None
+    matcher = matcher_for(scene, settings.evaluation, subject, choices)
+
+    def method(entry: Entry) -> Method:
+        return model(entry) if is_model(entry.path) else PictureFolder(entry, scene, matcher, depth)
+
+    return [method(entry) for entry in own]
+
+
+def place_for(path: Path, scene: str) -> Path:
+    """Returns a path with `{scene}` replaced; InputError: it does not exist."""
+    place = Path(str(path).replace("{scene}", scene))
+    if not place.exists():
+        raise InputError(f"'{place}' does not exist: give a folder of pictures, a splat file or a run folder")
+    return place
+
+
+def matcher_for(scene: Scene, options: EvalOptions, subject: Subject, choices: Choices) -> Matcher:
+    """Returns what finds views and zooms of pictures."""
+    aliases = {view: bare(file) for view, file in (subject.aliases or {}).items()}
+    names = names_of_views(scene.test, aliases)
+    order = None if choices.order is None else ordered_views(choices.order, names)
+    return Matcher(scene.test, names, [*options.zoom, *subject.prepared_zooms], order, choices.partial)
+
+
+def ordered_views(path: Path, names: Mapping[str, View]) -> list[View]:
+    """Returns the views that a list names; InputError: it names another."""
+    listed = read_order(path)
+    unknown = [name for name in listed if bare(name) not in names]
+    if unknown:
+        raise InputError(f"--order {path}: '{unknown[0]}' is no test view; the first is '{next(iter(names))}'")
+    return [names[bare(name)] for name in listed]
+
+
+def zooms_of(subject: Subject, methods: Sequence[Method], chosen: Sequence[float]) -> list[float]:
+    """Returns the zooms to measure: those that `eval.zoom` sets, else of the pictures, else of the prepared scene."""
+    own = subject.overrides[subject.own :]
+    if any(word.startswith("eval.zoom=") for word in own):
+        return sorted(set(chosen))
+    found = {factor for method in methods for factor in method.factors() or ()}
+    return sorted(found or subject.prepared_zooms or chosen)
+
+
+def with_shared_views(scene: Scene, methods: Sequence[Method], zooms: Sequence[float]) -> Scene:
+    """Returns the scene with the test views that all methods have, at each zoom that they have; InputError: none."""
+
+    def shared(view: View) -> bool:
+        return all(
+            method.camera(view, factor) is not None
+            for method in methods
+            for factor in set(method.factors() or zooms) & set(zooms)
+        )
+
+    views = [view for view in scene.test if shared(view)]
+    if not views:
+        raise InputError("no test view has pictures of all methods: compare them one by one")
+    if len(views) < len(scene.test):
+        logger.warning("%d of %d test views have pictures of all methods and are measured", len(views), len(scene.test))
+    return replace(scene, test=views)
+
+
+def log_notes(method: Method, zooms: Sequence[float], scene: Scene) -> None:
+    """Completes the notes of a method and logs them."""
+    if (factors := method.factors()) is not None:
+        missing = [factor for factor in zooms if factor not in factors]
+        unused = [factor for factor in factors if factor not in zooms]
+        method.notes += [f"there are no pictures at {listed(missing)}"] if missing else []
+        method.notes += [f"pictures at {listed(unused)} are not measured"] if unused else []
+    for factor, level in own_truth_psnr(method, scene).items():
+        method.notes.append(
+            f"the photos that it compared with at x{factor} differ from those of this protocol: {level:.2f} dB"
+        )
+    for note in method.notes:
+        logger.info("%s: %s", method.entry, note)
+
+
+def listed(zooms: Sequence[float]) -> str:
+    """Formats zooms."""
+    return ", ".join(f"x{factor:g}" for factor in zooms)
+
+
+# -- protocol ----------------------------------------------------------------------------------------------------------
+
+
+def protocol_for(settings: Settings, scene: Scene, zooms: Sequence[float], folder: Path) -> Protocol:
+    """Loads metrics and the upscaler that renders compete with."""
+    options, device = settings.evaluation, choose_device(settings.general.device)
+    metrics = MetricSettings(
+        input_range=options.lpips.input_range, pixels=options.perceptual_pixels, device=device, photos=scene.train
+    )
+    return Protocol(
+        options=options,
+        perceptual=load_metrics(options.perceptual, metrics),
+        lpips=load_lpips(options.lpips),
+        competitor=competitor_on(settings, scene, zooms, folder),
+        backend=settings.raster.backend.on(device.type),
+    )
+
+
+def competitor_on(settings: Settings, scene: Scene, zooms: Sequence[float], folder: Path) -> Competitor | None:
+    """Returns the upscaler of x1 pictures; None: there is none, or it reaches none of the zooms."""
+    if (chosen := settings.competitor) is None:
+        return None
+    component = chosen.component
+    context = RegeneratorContext(
+        views=scene.train,
+        reduction=scene.reduction,
+        render=lambda camera: refuse_learning(component.name)(0)[0],
+        held_out=refuse_learning(component.name),
+        step=0,
+        seed=0,
+        device=choose_device(settings.general.device),
+        folder=folder,
+    )
+    return competitor_for(scene, component.name, lambda: component.factory(chosen.options), zooms, context)
+
+
+def result_of(measured: Measured, scene: Scene) -> dict[str, Any]:
+    """Returns the results of one method."""
+    entry = measured.method.entry
+    return {
+        "name": entry.name,
+        "repetition": entry.repetition,
+        "path": str(entry.path),
+        **measured.method.facts(),
+        "notes": measured.method.notes,
+        "zoom": measured.means(),
+        "views": measured.views,
+    }
+
+
+def notes_in(results: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str, str]]:
+    """Yields scene, method and note."""
+    for result in results:
+        for method in result["methods"]:
+            yield from ((result["named"], method["name"], note) for note in method["notes"])
