@@ -265,6 +265,14 @@ def test_the_built_in_scene_is_written_without_a_folder(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "demo" / "images").iterdir())[0] == "train_000.png"
 
 
+@pytest.mark.parametrize("folder", ["train_only", "whole"])
+def test_commands_in_the_readme_train_on_training_views_alone(folder: str, request: pytest.FixtureRequest) -> None:
+    text = (request.getfixturevalue(folder) / "README.txt").read_text()
+    split = {"train.py": "--eval\n", "simple_trainer.py": "--test_every 8 "}
+    assert {word: option in text for word, option in split.items()} == dict.fromkeys(split, folder == "whole")
+    assert ("--eval-mode all" in text) == ("opensplat FOLDER" in text) == (folder == "train_only")
+
+
 # -- names -------------------------------------------------------------------------------------------------------------
 
 
@@ -299,6 +307,13 @@ def test_a_prepared_folder_stays_and_others_are_refused(
         assert main(["prepare", str(source), "--to", str(place)]) == 2
         assert reason in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_a_folder_inside_of_the_scene_is_refused(source: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Photos without poses are searched in subfolders."""
+    assert main(["prepare", str(source), "--to", str(source / "prepared")]) == 2
+    assert "inside of the scene's folder" in capsys.readouterr().err
+    assert not (source / "prepared").exists()
 
 
 def test_nothing_stays_of_a_folder_that_cannot_be_finished(

@@ -53,8 +53,9 @@ def heading(name: str, manifest: Mapping[str, Any]) -> str:
     width, height = manifest["protocol"]["size"]
     views = f"{len(manifest['train'])} training and {len(manifest['test'])} test views of {width} x {height} px"
     reduced = f"reduced by filter={manifest['filter']} of {manifest['light']} values"
+    made = reduced if "resize" in manifest["protocol"]["scene"] else "rendered at that size"
     return (
-        f"Scene '{name}' as gsx {manifest['gsx']} trains on it: {views}, {reduced}.\n"
+        f"Scene '{name}' as gsx {manifest['gsx']} trains on it: {views}, {made}.\n"
         f"Protocol {manifest['protocol']['hash']}. Settings: {shlex.join(manifest['overrides'])}\n"
     )
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gsx.core.errors import InputError
-from gsx.core.files import process_tag, read_json, remove_partial, sync_folder
+from gsx.core.files import expand_home, process_tag, read_json, remove_partial, sync_folder
 
 MANIFEST = "prepared.json"
 
@@ -38,6 +38,12 @@ def refuse_occupied(path: Path) -> None:
             raise InputError(f"--to {path} holds other files: choose a new folder")
     elif path.exists() or path.is_symlink():
         raise InputError(f"--to {path} is a file: choose a new folder")
+
+
+def refuse_inside(path: Path, scene: str) -> None:
+    """Raise InputError for a path inside of a scene's folder, where its photos would be searched."""
+    if scene and expand_home(scene).resolve() in path.resolve().parents:
+        raise InputError(f"--to {path} is inside of the scene's folder {scene}: choose a folder elsewhere")
 
 
 def is_prepared(path: Path, manifest: Mapping[str, Any]) -> bool:
