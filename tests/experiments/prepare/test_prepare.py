@@ -1,6 +1,7 @@
 """gsx prepare: other readers find the cameras, points and bytes that gsx trains on; nothing half written stays."""
 
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -325,6 +326,12 @@ def test_nothing_stays_of_a_folder_that_cannot_be_finished(
     monkeypatch.setattr(prepared, "write_transforms", full)
     assert main(["prepare", str(source), "--to", str(tmp_path / "out")]) == 2
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no folder that refuses all files")
+def test_a_place_that_cannot_be_written_is_named(source: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["prepare", str(source), "--to", "/proc/prepared"]) == 2
+    assert "(/proc/prepared)" in capsys.readouterr().err
 
 
 def test_an_empty_folder_is_filled(source: Path, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gsx.core.data.scene import Scene
+from gsx.core.data.scene import Scene, View
 from gsx.experiments.prepare.picture_names import Picture, pictures_of
 from gsx.experiments.prepare.zoom_cameras import Zoomed, zoomed_views
 
@@ -33,9 +33,14 @@ class Prepared:
         return "masks" in self.scene.provenance
 
     def work(self) -> float:
-        """Return the sum of sizes that `advance` will receive."""
-        finer = sum(factor**2 * len(views) for factor, views in self.zoomed.items()) if self.with_truth else 0
-        return len(self.pictures) + finer
+        """Return the sum of costs that `advance` will receive."""
+        finer = [(view, factor) for factor, views in self.zoomed.items() for view in views.values()]
+        return len(self.pictures) + sum(cost_of(view, factor) for view, factor in finer if self.with_truth)
+
+
+def cost_of(view: View, factor: float) -> float:
+    """Return the cost of a picture at a zoom: photos are decoded whole at any zoom, others rendered at that size."""
+    return factor**2 if view.file is None else 1
 
 
 def content_of(scene: Scene, zooms: Sequence[float], with_test: bool, with_truth: bool) -> Prepared:

@@ -20,7 +20,7 @@ from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.lpips import load_lpips
 from gsx.experiments.evaluation.protocol import protocol_of
 from gsx.experiments.prepare.colmap_files import write_model
-from gsx.experiments.prepare.content import Prepared, content_of
+from gsx.experiments.prepare.content import Prepared, content_of, cost_of
 from gsx.experiments.prepare.doubts import doubts_about
 from gsx.experiments.prepare.picture_names import every_eighth_is_test
 from gsx.experiments.prepare.readme import readme_of
@@ -42,7 +42,7 @@ CACHE_GB = 0.25
 README, NAMES = "README.txt", "test_views.txt"
 
 Advance = Callable[[float, str], None]
-"""Callback after each picture: its size in units of a training picture, and its name."""
+"""Callback after each picture: its cost in units of a training picture, and its name."""
 
 
 def prepare(
@@ -165,4 +165,4 @@ def write_truth(folder: Path, factor: float, views: Zoomed, advance: Advance) ->
     folder.mkdir(parents=True)
     for file, view in views.items():
         write_image(folder / file, view.picture())
-        advance(factor**2, f"{file} {zoom_name(factor)}")
+        advance(cost_of(view, factor), f"{file} {zoom_name(factor)}")

@@ -27,6 +27,10 @@ def whole_folder(path: Path) -> Iterator[Path]:
             path.rmdir()
         os.replace(temporary, path)
         sync_folder(path.parent)
+    except OSError as error:
+        if error.filename == str(temporary):  # report the name that the user knows
+            error.filename = str(path)
+        raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
