@@ -42,7 +42,7 @@ def number(row: Row, key: str) -> str:
     if not is_number(value):
         return ""
     digits = DIGITS.get(key, 4)
-    return signed(value, digits) if key in SIGNED else fixed(value, digits)
+    return signed(value, digits) if key in SIGNED else fixed(value, digits).replace("-", "\N{MINUS SIGN}")
 
 
 def gap(row: Row) -> str:
