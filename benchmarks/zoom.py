@@ -192,11 +192,10 @@ def seen_from_afar(folder: Path, way: str, overrides: Sequence[str]) -> float:
     path = (folder / "_".join(["afar", *re.findall(r"\w+", way)])).with_suffix(".json")
     if not path.is_file():
         run, settings = open_run(folder, plugins(), overrides)
-        evaluator, test = Evaluator(run, settings.evaluation), run.scene.test
+        options, test = settings.evaluation, run.scene.test
+        evaluator = Evaluator(run, options)
         views = [view.zoom(AFAR) for view in test[:: -(-len(test) // FEW)]]
-        shown = [
-            (evaluator.measured(evaluator.renders.render(v, AFAR).image), v.image()) for v in views if v is not None
-        ]
+        shown = [(options.measured(evaluator.renders.render(v, AFAR).image), v.image()) for v in views if v is not None]
         write_json(path, {"psnr": statistics.mean(psnr(image, truth) for image, truth in shown)})
     return float(read_json(path)["psnr"])
 

@@ -19,15 +19,15 @@ from gsx.experiments.runs.settings import Settings
 
 FOLDER = Path(__file__).parents[3] / "conf" / "protocol"
 OLD = Path(__file__).parents[2] / "old_run"
-INRIA = ("inria", True, "nearest", "excluded", "vgg", "unit")
-NERFBASELINES = ("valid", True, "down", "black", "alex", "signed")
+INRIA = ("inria", True, "nearest", False, "excluded", "vgg", "unit")
+NERFBASELINES = ("valid", True, "down", False, "black", "alex", "signed")
 MEASURING = {
     "inria": INRIA,
     "nerfbaselines": NERFBASELINES,
-    "nerfstudio": ("valid", False, "nearest", "excluded", "alex", "signed"),
-    "gsplat": ("torchmetrics", False, "nearest", "excluded", "alex", "signed"),
+    "nerfstudio": ("valid", False, "nearest", True, "excluded", "alex", "signed"),
+    "gsplat": ("torchmetrics", False, "nearest", True, "excluded", "alex", "signed"),
 }
-"""SSIM, 8 bits, rounding, masks, network and range of LPIPS."""
+"""SSIM, 8 bits, rounding, clamp, masks, network and range of LPIPS."""
 PHOTOS, WHITE = {"split": "every:8"}, {"background": [1.0, 1.0, 1.0], "split": "json"}
 PAPERS: dict[str, tuple[tuple[Any, ...], str, dict[str, Any], list[float]]] = {
     "inria_outdoors": (INRIA, "colmap", PHOTOS | {"images": "images_4", "downscale": 1}, [1]),
@@ -55,7 +55,7 @@ PAPERS: dict[str, tuple[tuple[Any, ...], str, dict[str, Any], list[float]]] = {
 def measures(settings: Settings) -> tuple[Any, ...]:
     """What MEASURING lists."""
     e = settings.evaluation
-    return e.ssim, e.quantise, e.rounding, e.masks, e.lpips.net, e.lpips.input_range
+    return e.ssim, e.quantise, e.rounding, e.clamp, e.masks, e.lpips.net, e.lpips.input_range
 
 
 def test_every_protocol_is_in_these_tables() -> None:

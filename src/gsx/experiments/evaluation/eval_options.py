@@ -3,8 +3,11 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from gsx.core.quality.metrics import ROUNDINGS, SSIM_VARIANTS
+from torch import Tensor
+
+from gsx.core.quality.metrics import ROUNDINGS, SSIM_VARIANTS, quantise
 from gsx.core.ranges import Range
+from gsx.core.shapes import Float
 from gsx.experiments.evaluation.lpips import LpipsOptions
 from gsx.experiments.evaluation.perceptual import METRICS
 
@@ -49,6 +52,8 @@ class EvalOptions(MetricOptions):
     """Factor by which renders are finer than each picture before they are reduced; 0: as in training."""
     rounding: str = "nearest"
     """nearest: to the nearest of 256 levels; down: to the next lower one. Without effect unless quantised."""
+    clamp: bool = False
+    """True: renders that are not quantised are clamped to [0, 1]."""
     masks: str = "excluded"
     """excluded: PSNR and SSIM leave masked pixels out; black: they count, black in both pictures."""
     colours: str = "rendered"
@@ -72,6 +77,12 @@ class EvalOptions(MetricOptions):
                 raise ValueError(f"eval.{name} is '{getattr(self, name)}'; choose from {', '.join(known)}")
         if not self.zoom:
             raise ValueError("eval.zoom is empty; give factors, for example [1,2,4]")
+
+    def measured(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+        """Returns a picture as metrics get it: quantised to 8 bits, clamped, or as it is."""
+        if self.quantise:
+            return quantise(image, self.rounding)
+        return image.clamp(0, 1) if self.clamp else image
 
     @property
     def right_halves(self) -> bool:

@@ -17,7 +17,7 @@ from torch import Tensor
 from gsx.core.data.masks import black_out
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
-from gsx.core.quality.metrics import bicubic, psnr, quantise, ssim
+from gsx.core.quality.metrics import bicubic, psnr, ssim
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.parameter_table import size_of
 from gsx.core.training.render import render
@@ -90,10 +90,6 @@ class Evaluator:
         self.kept: dict[View, Tensor] = {}
         """Renders at the training resolution, as bytes where they are quantised."""
 
-    def measured(self, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-        """Returns a picture as metrics get it: quantised to 8 bits if the protocol says so."""
-        return quantise(image, self.options.rounding) if self.options.quantise else image
-
     def view(self, view: View) -> dict[str, Any]:
         """Measures one view at the training resolution."""
         self.renders.camera(view)  # estimating it is not part of the time of a render
@@ -127,7 +123,7 @@ class Evaluator:
 
     def keep(self, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
         """Keeps an x1 render as it is measured, and returns it."""
-        whole = self.measured(self.renders.fit(view, image))
+        whole = self.options.measured(self.renders.fit(view, image))
         self.kept[view] = to_uint8(whole) if self.options.quantise else whole
         return whole
 
@@ -150,12 +146,12 @@ class Evaluator:
             view=finer,
             factor=factor,
             truth=black_out(finer.image(), counted),
-            render=black_out(self.measured(image), counted),
-            enlarged=black_out(self.measured(enlarged), counted),
-            photograph=black_out(self.measured(photograph), counted),
+            render=black_out(self.options.measured(image), counted),
+            enlarged=black_out(self.options.measured(enlarged), counted),
+            photograph=black_out(self.options.measured(photograph), counted),
             counted=self.renders.evaluated_pixels(finer, counted),
         )
-        return self.competitor.join(zoomed, whole, view, self.measured) if self.competitor else zoomed
+        return self.competitor.join(zoomed, whole, view, self.options.measured) if self.competitor else zoomed
 
     def work(self) -> float:
         """Returns the sum of sizes that `advance` will receive."""

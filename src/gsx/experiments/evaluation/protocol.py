@@ -32,6 +32,8 @@ def protocol_of(scene: Scene, options: EvalOptions, lpips_name: str) -> dict[str
         protocol |= {"masks": MASKED[options.masks]}
     if options.quantise and options.rounding != "nearest":
         protocol |= {"rounding": options.rounding}
+    if options.clamp and not options.quantise:
+        protocol |= {"clamped": True}
     if options.colours == "fitted":
         protocol |= {"colours": "3x4 matrix a view, least squares on the left half; all figures of the right half"}
     if options.poses == "aligned":

@@ -10,7 +10,7 @@ from torch import Tensor
 from gsx.core.backend import EAGER, Backend
 from gsx.core.data.masks import black_out
 from gsx.core.data.scene import Scene, View
-from gsx.core.quality.metrics import bicubic, psnr, quantise
+from gsx.core.quality.metrics import bicubic, psnr
 from gsx.core.shapes import Bool, Float
 from gsx.experiments.evaluation.competitor import Competitor
 from gsx.experiments.evaluation.cross_view import CrossViews
@@ -26,7 +26,7 @@ from gsx.experiments.judge.similarity_variants import all_ssim, named
 Picture: TypeAlias = Float[Tensor, "3 H W"]
 RIVALS = ("enlarged", "upscaled")
 """Pictures that a zoomed render is compared with."""
-DETAILED = ("render",)
+DETAILED = ("render", "enlarged")
 """Pictures whose explained detail is measured."""
 
 
@@ -43,10 +43,6 @@ class Protocol:
     def evaluated(self, counted: Bool[Tensor, "H W"] | None) -> Bool[Tensor, "H W"] | None:
         """Returns the pixels that are evaluated, of those that a mask keeps; None: all."""
         return None if self.options.masks == "black" else counted
-
-    def measured(self, image: Picture) -> Picture:
-        """Returns a picture as metrics get it: quantised to 8 bits if the protocol says so."""
-        return quantise(image, self.options.rounding) if self.options.quantise else image
 
 
 @dataclass(kw_only=True)
@@ -131,7 +127,7 @@ class Measurement:
         """Returns a method's picture as it is measured; None: there is none."""
         if method.camera(view, factor) is None:
             return None
-        return self.protocol.measured(method.picture(view, factor))
+        return self.protocol.options.measured(method.picture(view, factor))
 
     def zoomed(self, method: Method, view: View, factor: float, first: Picture | None) -> Zoomed | None:
         """Returns a method's picture of a view with its truth and rivals; None: there is no picture.
@@ -149,16 +145,17 @@ class Measurement:
             factor=factor,
             truth=black_out(truth, counted),
             render=black_out(image, counted),
+            photograph=black_out(self.enlarged(view.image(), finer), counted),
             enlarged=None if first is None else black_out(self.enlarged(first, finer), counted),
             counted=self.protocol.evaluated(counted),
         )
         if self.protocol.competitor is None or first is None or camera.size != view.camera.zoom(factor).size:
             return zoomed
-        return self.protocol.competitor.join(zoomed, first, view, self.protocol.measured)
+        return self.protocol.competitor.join(zoomed, first, view, self.protocol.options.measured)
 
     def enlarged(self, picture: Picture, finer: View) -> Picture:
         """Returns a picture on the raster of a finer view, by bicubic interpolation."""
-        return self.protocol.measured(bicubic(picture, *finer.camera.size))
+        return self.protocol.options.measured(bicubic(picture, *finer.camera.size))
 
     # -- figures -------------------------------------------------------------------------------------------------------
 
@@ -172,10 +169,11 @@ class Measurement:
             f"{name}_psnr": psnr(picture, zoomed.truth, zoomed.counted)
             for name, picture in zoomed.pictures(RIVALS).items()
         }
+        photo = {"photograph_psnr": psnr(zoomed.photograph, zoomed.truth, zoomed.counted)}
         pictures = zoomed.pictures(DETAILED) if zoomed.view.counted() is None else {}
         return ZoomFigures(
             zoomed.view.group,
-            self.of_render(zoomed) | rivals,
+            self.of_render(zoomed) | rivals | photo,
             details_of(pictures, zoomed.truth, zoomed.factor) if pictures else {},
             self.perceptual(zoomed, ("render", *RIVALS)),
         )

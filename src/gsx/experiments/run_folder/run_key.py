@@ -33,6 +33,7 @@ UNCHANGED = {
     "scene.near": 2,
     "scene.retry_pairs": 2000,
     "eval.rounding": "nearest",
+    "eval.clamp": False,
     "eval.masks": "excluded",
     "backbone.density.passes": 1.0,
     "backbone.clone_split.density.passes": 1.0,
