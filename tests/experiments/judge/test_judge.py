@@ -283,13 +283,14 @@ def test_unusable_pictures_are_refused_in_a_sentence(
         (["a={pictures}", "{subject}", "--order", "nowhere.txt"], "does not exist"),
         (["a={pictures}", "nowhere"], "neither NAME=PATH"),
         (["a={empty}", "{subject}"], "holds no pictures"),
+        (["a={file}", "{subject}"], "is no splat file"),
     ],
 )
 def test_unusable_words_are_refused_in_a_sentence(
     words: list[str], sentence: str, subject: Subject, pictures: Path, tmp_path: Path, capsys
 ) -> None:
     (tmp_path / "empty").mkdir()
-    places = {"subject": subject.folder, "pictures": pictures, "empty": tmp_path / "empty"}
+    places = {"subject": subject.folder, "pictures": pictures, "empty": tmp_path / "empty", "file": __file__}
     filled = [word.format(**places) for word in words]
     settings = [word for word in subject.words[1:] if word.partition("=")[0] not in " ".join(words)]
     assert main(["judge", *filled, *settings, "--to", str(tmp_path / "out")]) == 2

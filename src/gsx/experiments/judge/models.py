@@ -8,11 +8,13 @@ from typing import Any
 
 import torch
 
+from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene
 from gsx.core.errors import InputError
 from gsx.core.plugins import Plugins
 from gsx.core.training.run import Run
 from gsx.experiments.judge.methods import Entry, Model
+from gsx.experiments.judge.view_names import bare
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.file_axes import start_in_scene
@@ -53,7 +55,7 @@ def opened_run(entry: Entry, settings: Settings, plugins: Plugins, scene: Scene)
     refuse_other_poses(entry, run, settings, scene)
     facts = {"backbone": own.backbone.component.name, "step": run.step, "train_seconds": run.progress.seconds}
     model = Model(entry, run, scene, settings.evaluation, facts)
-    model.notes += trained_on_test(run, scene)
+    model.notes += remarks_on_views(run, scene)
     return model
 
 
@@ -62,12 +64,12 @@ def refuse_other_poses(entry: Entry, run: Run, settings: Settings, scene: Scene)
     unit = float(getattr(settings.scene.options, "unit", 1.0))
     if unit_of(run) != unit:
         raise InputError(f"{entry.path} was trained with scene.unit={unit_of(run):g}, the scene has {unit:g}")
-    own = {view.name: view.camera for view in (*run.scene.test, *run.train_views)}
+    own = cameras_by_name(run)
     between = torch.tensor(run.scene.origin, dtype=torch.float64) - torch.tensor(scene.origin, dtype=torch.float64)
     for view in scene.test:
-        if view.name not in own:
+        if (camera := own.get(bare(view.name))) is None:
             continue
-        distance = float((own[view.name].centre.double() + between - view.camera.centre.double()).norm())
+        distance = float((camera.centre.double() + between - view.camera.centre.double()).norm())
         if distance > SAME_POSE * scene.extent:
             raise InputError(
                 f"{entry.path}: its view '{view.name}' stands {distance:.3g} units from that of the scene: the "
@@ -75,11 +77,18 @@ def refuse_other_poses(entry: Entry, run: Run, settings: Settings, scene: Scene)
             )
 
 
-def trained_on_test(run: Run, scene: Scene) -> Iterator[str]:
+def cameras_by_name(run: Run) -> dict[str, Camera]:
+    """Returns the cameras of a run's views by their names without suffix, which prepared scenes keep."""
+    return {bare(view.name): view.camera for view in (*run.train_views, *run.scene.test)}
+
+
+def remarks_on_views(run: Run, scene: Scene) -> Iterator[str]:
     """Yields a note if a run was trained on test views, or shares no view with them."""
-    trained = {view.name for view in run.train_views} & {view.name for view in scene.test}
-    if trained:
+    test = {bare(view.name) for view in scene.test}
+    if trained := {bare(view.name) for view in run.train_views} & test:
         yield f"it was trained on {len(trained)} of the {len(scene.test)} test views: its figures are too good"
+    if not cameras_by_name(run).keys() & {bare(view.name) for view in (*scene.test, *scene.train)}:
+        yield "none of its views has the name of a view of the scene: check that it shows the same scene"
 
 
 def opened_file(entry: Entry, overrides: Sequence[str], settings: Settings, plugins: Plugins, scene: Scene) -> Model:

@@ -27,6 +27,7 @@ from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.progress import Countdown
 from gsx.experiments.runs.settings import Settings
+from gsx.formats.suffixes import READABLE
 
 logger = logging.getLogger(__name__)
 
@@ -137,10 +138,12 @@ def methods_of(
 
 
 def place_for(path: Path, scene: str) -> Path:
-    """Returns a path with `{scene}` replaced; InputError: it does not exist."""
+    """Returns a path with `{scene}` replaced; InputError: it does not exist, or is another kind of file."""
     place = Path(str(path).replace("{scene}", scene))
     if not place.exists():
         raise InputError(f"'{place}' does not exist: give a folder of pictures, a splat file or a run folder")
+    if not place.is_dir() and not is_model(place):
+        raise InputError(f"'{place}' is no splat file ({READABLE}): give a folder of pictures, or a run folder")
     return place
 
 
