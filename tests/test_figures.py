@@ -32,6 +32,7 @@ NO_MEASUREMENTS: list[tuple[str, str, str]] = [
     ),
     ("docs/reference/augmenters.md", "reconstructs to some 23 dB", "published for kl-f8: 23.4 +- 3.8 dB on ImageNet"),
     ("docs/how-to/sweeps-and-clusters.md", "30 seconds later", "torchrun's own patience"),
+    ("docs/how-to/compare-programs.md", "95 % interval", "the level of an interval"),
     ("docs/benchmarks/extremes.md", "at most 1 % of", "a bound of tests/extremes"),
     ("docs/reference/regenerators.md", "2.3 GB | 3 GB", "estimates from numbers of parameters, as the page says"),
     ("docs/reference/regenerators.md", "3.5 GB | 5 GB", "the same"),

@@ -37,8 +37,7 @@ More commands; view, eval and export also take splat files of other programs:
   gsx render RUN             save test views as PNG; animate --orbit FILE.gif or a camera --path FILE.json
   gsx compact RUN            shrink a model while PSNR drops by at most --max-drop-db 0.1
   gsx report DIR ...         write report.html of a run, or one page that compares all runs below some folders
-  gsx explain KEY            explain a setting: value, range, meaning, and the file that sets it
-  gsx datasets, gsx plugins  list the paper's datasets on this machine; list installed components
+  gsx explain KEY            explain a setting; gsx datasets, gsx plugins list datasets and components on this machine
 
 Every setting is a word KEY=VALUE:
   gsx scene=colmap scene.path=FOLDER scene.downscale=4 iterations=2000 'eval.zoom=[1,2,4]'

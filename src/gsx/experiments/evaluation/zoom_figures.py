@@ -47,6 +47,8 @@ def zoom_figures(zoomed: Zoomed, ssim: Ssim) -> dict[str, float]:
         prefix = "" if name == "render" else f"{name}_"
         figures[f"{prefix}psnr"] = psnr(picture, truth, counted)
         figures[f"{prefix}ssim"] = ssim(picture, truth, counted)
+    if zoomed.photograph is None:
+        return figures
     return figures | {"photograph_psnr": psnr(zoomed.photograph, truth, counted)}
 
 

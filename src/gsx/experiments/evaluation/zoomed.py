@@ -18,8 +18,8 @@ class Zoomed:
     factor: float
     truth: Float[Tensor, "3 H W"]
     render: Float[Tensor, "3 H W"]
-    photograph: Float[Tensor, "3 H W"]
-    """The truth at the training resolution, enlarged: the best picture without new detail."""
+    photograph: Float[Tensor, "3 H W"] | None = None
+    """The truth at the training resolution, enlarged: the best picture without new detail; None: it is not measured."""
     enlarged: Float[Tensor, "3 H W"] | None = None
     """The x1 render enlarged by bicubic interpolation; None: there is no x1 render."""
     upscaled: Float[Tensor, "3 H W"] | None = None

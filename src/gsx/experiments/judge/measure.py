@@ -26,7 +26,7 @@ from gsx.experiments.judge.similarity_variants import all_ssim, named
 Picture: TypeAlias = Float[Tensor, "3 H W"]
 RIVALS = ("enlarged", "upscaled")
 """Pictures that a zoomed render is compared with."""
-DETAILED = ("render", "enlarged")
+DETAILED = ("render",)
 """Pictures whose explained detail is measured."""
 
 
@@ -145,7 +145,6 @@ class Measurement:
             factor=factor,
             truth=black_out(truth, counted),
             render=black_out(image, counted),
-            photograph=black_out(self.enlarged(view.image(), finer), counted),
             enlarged=None if first is None else black_out(self.enlarged(first, finer), counted),
             counted=self.protocol.evaluated(counted),
         )
@@ -169,11 +168,10 @@ class Measurement:
             f"{name}_psnr": psnr(picture, zoomed.truth, zoomed.counted)
             for name, picture in zoomed.pictures(RIVALS).items()
         }
-        photo = {"photograph_psnr": psnr(zoomed.photograph, zoomed.truth, zoomed.counted)}
         pictures = zoomed.pictures(DETAILED) if zoomed.view.counted() is None else {}
         return ZoomFigures(
             zoomed.view.group,
-            self.of_render(zoomed) | rivals | photo,
+            self.of_render(zoomed) | rivals,
             details_of(pictures, zoomed.truth, zoomed.factor) if pictures else {},
             self.perceptual(zoomed, ("render", *RIVALS)),
         )

@@ -9,20 +9,28 @@ from gsx.experiments.judge.tables import HEADINGS, columns, gap, number
 from gsx.experiments.reports.page import template
 from gsx.experiments.run_folder.shapes import is_number
 
+LEAST = 0.005
+"""Smallest difference that is coloured, dB: smaller ones are 0.00."""
+
 
 def page_of(content: Mapping[str, Any], rows: Sequence[Row], means: Sequence[Row]) -> str:
     """Renders the page of results; pictures lie in `pictures/`."""
     results = content["results"]
     blocks = [block_of(result, rows) for result in results]
-    keys = columns(means)
+    keys, scenes = columns(means), {block["scene"] for block in blocks}
     return template("judge/comparison.html").render(
-        title=f"{len(content['methods'])} methods, {len({block['scene'] for block in blocks})} scenes",
+        title=", ".join([counted(len(content["methods"]), "method"), counted(len(scenes), "scene")]),
         version=__version__,
         content=content,
         blocks=blocks,
         means=[cells(row, keys) for row in means],
         headings=[HEADINGS.get(key, key) for key in keys],
     )
+
+
+def counted(number: int, noun: str) -> str:
+    """Returns a number with its noun."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def block_of(result: Mapping[str, Any], rows: Sequence[Row]) -> dict[str, Any]:
@@ -51,7 +59,8 @@ def cells(row: Row, keys: Sequence[str]) -> dict[str, Any]:
     return {"scene": row["scene"], "protocol": row["protocol"], "zoom": row["zoom"], "method": row["method"]} | {
         "figures": figures,
         "gap": gap(row),
-        "better": is_number(row.get("difference_mean")) and row["difference_mean"] > 0,
+        "better": is_number(row.get("difference_mean")) and row["difference_mean"] >= LEAST,
+        "worse": is_number(row.get("difference_mean")) and row["difference_mean"] <= -LEAST,
     }
 
 

@@ -14,7 +14,7 @@ from gsx.experiments.run_folder.shapes import is_number
 
 Row: TypeAlias = dict[str, Any]
 Results: TypeAlias = Sequence[Mapping[str, Any]]
-FIGURES = ("psnr", "ssim", "ssim_inria", "ssim_torchmetrics", "ssim_valid", "lpips", "photograph_psnr")
+FIGURES = ("psnr", "ssim", "ssim_inria", "ssim_torchmetrics", "ssim_valid", "lpips")
 """Means over views that a zoom has under these keys."""
 GAINS = {"gain_over_enlarged": "enlarged_psnr", "gain_over_upscaled": "upscaled_psnr"}
 """Differences of `psnr` from rivals, dB."""

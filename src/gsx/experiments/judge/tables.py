@@ -21,7 +21,7 @@ HEADINGS = {
     "gain_over_enlarged": "over enlarged, dB",
     "gain_over_upscaled": "over network, dB",
 }
-HIDDEN = ("views", "repetitions", "ssim_inria", "ssim_torchmetrics", "ssim_valid", "photograph_psnr")
+HIDDEN = ("views", "repetitions", "ssim_inria", "ssim_torchmetrics", "ssim_valid")
 """Columns that text and page leave out; CSV has them."""
 SIGNED = ("gain_over_enlarged", "gain_over_upscaled")
 
@@ -42,7 +42,7 @@ def number(row: Row, key: str) -> str:
     if not is_number(value):
         return ""
     digits = DIGITS.get(key, 4)
-    return signed(value, digits) if key in SIGNED else fixed(value, digits)
+    return signed(value, digits) if key in SIGNED else fixed(value, digits).replace("-", "\N{MINUS SIGN}")
 
 
 def gap(row: Row) -> str:
