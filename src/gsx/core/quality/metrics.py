@@ -26,7 +26,7 @@ def psnr(
     image: Float[Tensor, "C H W"], target: Float[Tensor, "C H W"], counted: Bool[Tensor, "H W"] | None = None
 ) -> float:
     """Returns the PSNR of the pixels that count (None: all), dB; inf for equal images, nan for no pixels."""
-    squares = (image.double() - target.double()).square()
+    squares = image.detach().to(torch.float64, copy=True).sub_(target).square_()
     return decibel(float((squares if counted is None else squares[:, counted.to(squares.device)]).mean()))
 
 
