@@ -32,7 +32,7 @@ def parse_methods(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--to", type=Path, metavar="FOLDER", help="new folder for the page (outputs/comparisons/TIME)")
     against = "method that the others are compared with (the first)"
     parser.add_argument("--against", default="", metavar="METHOD", help=against)
-    protocols = "measure by each of these protocols: names of conf/protocol, by commas"
+    protocols = "measure by each of these protocols of conf/protocol; sizes and test views stay those of the scene"
     parser.add_argument("--protocols", type=names, default=[], metavar="A,B", help=protocols)
     order = "list of the views that numbered pictures show, one a line, or a camera file"
     parser.add_argument("--order", type=Path, metavar="FILE", help=order)

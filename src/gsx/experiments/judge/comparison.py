@@ -64,6 +64,8 @@ def compare_methods(
         (folder / PICTURES).mkdir()
         results = []
         for number, (subject, name) in enumerate((s, p) for s in subjects for p in protocols or [""]):
+            if name:
+                logger.info("protocol %s", name)
             measured = with_protocol(subject, name, plugins)
             found = measure_scene(measured, entries, choices, plugins, folder / PICTURES, f"{number}")
             results.append({"protocol_name": name, **found})

@@ -21,7 +21,8 @@ from gsx.experiments.runs.file_axes import start_in_scene
 from gsx.experiments.runs.load_scene import unit_of
 from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.settings import Settings
-from gsx.experiments.runs.start_file import composition_of, starting_splats
+from gsx.experiments.runs.start_file import composition_of
+from gsx.formats.splat_files import read_splats
 from gsx.formats.suffixes import splat_file_at, suffix_of
 
 logger = logging.getLogger(__name__)
@@ -96,7 +97,10 @@ def opened_file(entry: Entry, overrides: Sequence[str], settings: Settings, plug
     file = splat_file_at(entry.path)
     words = [word for word in overrides if not word.startswith(OF_EVALUATION)]
     own = compose(composition_of(file, words), plugins)
-    start, doubts = start_in_scene(own, scene, starting_splats(own))
+    content = read_splats(file, own.general.axes)
+    if not len(content.gaussians.means):
+        raise InputError(f"{file} holds no splats: choose another file")
+    start, doubts = start_in_scene(own, scene, content)
     run = build(own, scene, Path(), start=start)
     facts: dict[str, Any] = {"backbone": "splat file", "file": file.name}
     model = Model(entry, run, scene, replace(own.evaluation, supersample=settings.evaluation.supersample), facts)

@@ -18,6 +18,8 @@ FIGURES = ("psnr", "ssim", "ssim_inria", "ssim_torchmetrics", "ssim_valid", "lpi
 """Means over views that a zoom has under these keys."""
 GAINS = {"gain_over_enlarged": "enlarged_psnr", "gain_over_upscaled": "upscaled_psnr"}
 """Differences of `psnr` from rivals, dB."""
+AGREEMENT = {"consistency": "render", "consistency_truth": "truth"}
+"""Agreement of neighbouring views, dB: of a method's pictures, and of the photos."""
 PLACE = ("scene", "protocol", "zoom", "method")
 LOWER = ("lpips", "st_lpips_alex", "st_lpips_vgg", "lpips_alex", "lpips_vgg", "niqe")
 """Figures of which less is better."""
@@ -63,12 +65,14 @@ def row_of(result: Mapping[str, Any], zoom: str, name: str, baseline: str) -> Ro
     """Returns the row of one method at one zoom."""
     entries = [method["zoom"][zoom] for method in repetitions(result, name) if zoom in method["zoom"]]
     found = [figures_of(entry) for entry in entries]
+    levels = [finite(by_view(method["views"], zoom, "psnr")).values() for method in repetitions(result, name)]
     keys = [key for key in found[0] if all(key in figures for figures in found)]
     means = {key: statistics.fmean(figures[key] for figures in found) for key in keys}
     compared = difference_of(result, zoom, "psnr", name, baseline)
     gap = {f"difference_{key}": value for key, value in asdict(compared).items()} if compared else {}
     place = {"scene": result["named"], "protocol": result["protocol_name"], "zoom": zoom, "method": name}
-    return {**place, "views": entries[0]["views"], "repetitions": len(found), **means, **gap}
+    worst = {"worst_psnr": statistics.fmean(min(views) for views in levels if views)} if any(levels) else {}
+    return {**place, "views": entries[0]["views"], "repetitions": len(found), **means, **worst, **gap}
 
 
 def figures_of(entry: Mapping[str, Any]) -> dict[str, float]:
@@ -78,12 +82,14 @@ def figures_of(entry: Mapping[str, Any]) -> dict[str, float]:
     perceptual = {name: pictures["render"] for name, pictures in part(dict(entry), "perceptual").items()}
     detail = part(part(dict(entry), "detail"), "render").get("explained")
     levels = part(dict(entry), "consistency")
+    agreement = {name: levels.get(kind) for name, kind in AGREEMENT.items()}
+    agreement["agreeing_detail"] = part(levels, "detail").get("render")
     return {
         **whole,
         **gains,
         **perceptual,
         **({"explained_detail": detail} if is_number(detail) else {}),
-        **({"consistency": levels["render"]} if is_number(levels.get("render")) else {}),
+        **{name: value for name, value in agreement.items() if is_number(value)},
     }
 
 

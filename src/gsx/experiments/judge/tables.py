@@ -9,19 +9,30 @@ from gsx.experiments.reports.page import fixed, signed
 from gsx.experiments.run_folder.shapes import is_number
 from gsx.experiments.tables.table_text import aligned
 
-DIGITS = {"psnr": 2, "gain_over_enlarged": 2, "gain_over_upscaled": 2, "consistency": 2, "explained_detail": 3}
+DIGITS = {
+    "psnr": 2,
+    "worst_psnr": 2,
+    "agreeing_detail": 2,
+    "gain_over_enlarged": 2,
+    "gain_over_upscaled": 2,
+    "consistency": 2,
+    "explained_detail": 3,
+}
 """Decimals of figures; others have 4."""
 HEADINGS = {
     "psnr": "PSNR, dB",
+    "worst_psnr": "worst view, dB",
     "ssim": "SSIM",
     "lpips": "LPIPS",
+    "st_lpips_alex": "ST-LPIPS",
     "niqe": "NIQE",
     "explained_detail": "detail",
     "consistency": "consistency, dB",
+    "agreeing_detail": "agreeing detail",
     "gain_over_enlarged": "over enlarged, dB",
     "gain_over_upscaled": "over network, dB",
 }
-HIDDEN = ("views", "repetitions", "ssim_inria", "ssim_torchmetrics", "ssim_valid")
+HIDDEN = ("views", "repetitions", "consistency_truth", "ssim_inria", "ssim_torchmetrics", "ssim_valid")
 """Columns that text and page leave out; CSV has them."""
 SIGNED = ("gain_over_enlarged", "gain_over_upscaled")
 

@@ -1,4 +1,4 @@
-"""Composition of overrides by Hydra; `config_files`, `overrides` and `multirun` use Hydra as well."""
+"""Composition of overrides by Hydra; `config_files`, `overrides`, `multirun` and `protocols` use Hydra as well."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
