@@ -48,8 +48,8 @@ def parse_methods(arguments: list[str]) -> argparse.Namespace:
 
 
 def names(word: str) -> list[str]:
-    """Split names at commas."""
-    return [name for name in word.split(",") if name]
+    """Split names at commas; a name that is repeated counts once."""
+    return list(dict.fromkeys(name for name in word.split(",") if name))
 
 
 def sorted_words(words: list[str]) -> tuple[list[tuple[str, Path]], list[Path], list[str]]:

@@ -155,8 +155,15 @@ def pictures_in(folder: Path) -> tuple[Path, ...]:
 
 
 def pictures_below(folder: Path) -> tuple[Path, ...]:
-    """Returns the pictures in a folder and its sub-folders, by name; none: it does not exist."""
-    return tuple(only_pictures(sorted(folder.rglob("*")))) if folder.is_dir() else ()
+    """Returns the pictures in a folder and its visible sub-folders, by name; none: it does not exist."""
+    if not folder.is_dir():
+        return ()
+    return tuple(file for file in only_pictures(sorted(folder.rglob("*"))) if not is_hidden(file.relative_to(folder)))
+
+
+def is_hidden(path: Path) -> bool:
+    """Returns whether a path leads through a hidden folder, such as .ipynb_checkpoints."""
+    return any(part.startswith(".") for part in path.parts)
 
 
 def only_pictures(paths: Sequence[Path]) -> Iterator[Path]:

@@ -82,20 +82,32 @@ class Matcher:
     def match(self, pictures: PictureSet) -> tuple[dict[View, Path], list[str], bool]:
         """Returns the pictures by view, remarks, and whether order alone decided."""
         named = dict(self.named(pictures))
-        listed = None if self.order is not None else order_near(pictures.folder, self.names)
-        numbered = pictures.numbered or not named
-        if numbered and listed is not None:
-            views, note = listed[1], f"views in the order of {listed[0].name}"
-            return self.in_order(pictures, views), [note], False
-        if numbered and all(NUMBER.search(file.stem) for file in pictures.files):
-            if self.order is not None:
-                return self.in_order(pictures, self.order), ["views in the order of --order"], False
-            note = "pictures are numbered: taken in the order of the test views"
-            return self.in_order(pictures, self.views), [note], True
+        if not self.has_names(pictures, named):
+            listed = None if self.order is not None else order_near(pictures.folder, self.names)
+            if listed is not None:
+                note = f"views in the order of {listed[0].name}"
+                return self.in_order(pictures, listed[1], f"in '{listed[0]}'"), [note], False
+            if all(NUMBER.search(file.stem) for file in pictures.files):
+                return self.by_number(pictures)
         self.refuse_missing(pictures, named)
         extra = len(pictures.files) - len(named)
         notes = [f"{extra} pictures are of no test view and are left out"] if extra else []
         return named, notes, False
+
+    def has_names(self, pictures: PictureSet, named: Mapping[View, Path]) -> bool:
+        """Returns whether pictures have the names of views, some of which a number may have by chance."""
+        if pictures.numbered:
+            return len(named) == len(pictures.files)
+        if self.order is None:
+            return bool(named)
+        return len(named) in (len(self.views), len(pictures.files))
+
+    def by_number(self, pictures: PictureSet) -> tuple[dict[View, Path], list[str], bool]:
+        """Returns numbered pictures by view, in the order of --order or of the test views, and a remark."""
+        if self.order is not None:
+            return self.in_order(pictures, self.order, "in --order"), ["views in the order of --order"], False
+        note = "pictures are numbered: taken in the order of the test views"
+        return self.in_order(pictures, self.views, "held out"), [note], True
 
     def named(self, pictures: PictureSet) -> Iterator[tuple[View, Path]]:
         """Yields pictures that have the name of a view; InputError: two have the same."""
@@ -106,20 +118,21 @@ class Matcher:
             if view is None:
                 continue
             if view.name in found:
+                first, other = (one.relative_to(pictures.folder) for one in (found[view.name], file))
                 raise InputError(
-                    f"'{pictures.folder}' has two pictures of view '{view.name}', {found[view.name].name} and "
-                    f"{file.name}: keep one, or put each zoom into a folder of its own, x1/ and x4/"
+                    f"'{pictures.folder}' has two pictures of view '{view.name}', {first} and {other}: keep one, or "
+                    "put each zoom into a folder of its own, x1/ and x4/"
                 )
             found[view.name] = file
             yield view, file
 
-    def in_order(self, pictures: PictureSet, views: Sequence[View]) -> dict[View, Path]:
-        """Returns numbered pictures by view; InputError: their number is another."""
+    def in_order(self, pictures: PictureSet, views: Sequence[View], where: str) -> dict[View, Path]:
+        """Returns numbered pictures by view; InputError: their number is not that of the views listed `where`."""
         if len(pictures.files) != len(views):
             raise InputError(
-                f"'{pictures.folder}' has {len(pictures.files)} pictures for {len(views)} test views, and their names "
-                f"are not those of views ({self.example(pictures)}): name them as the views, or give --order FILE with "
-                "the name of each picture's view, one a line"
+                f"'{pictures.folder}' holds {len(pictures.files)} pictures, but there are {len(views)} test views "
+                f"{where}, and the pictures do not have the names of views ({self.example(pictures)}): name them as "
+                "the views, or give --order FILE with the name of each picture's view, one a line"
             )
         return dict(zip(views, sorted(pictures.files, key=number_of), strict=True))
 
@@ -183,10 +196,10 @@ class Matcher:
         return f"and view '{view.name}' is {listed}: render one of these sizes, or choose scene.downscale to fit"
 
 
-def number_of(file: Path) -> tuple[int, str]:
-    """Returns the number at the end of a picture's name, and the name."""
+def number_of(file: Path) -> tuple[str, int, str]:
+    """Returns what precedes the number at the end of a picture's name, the number, and the name, to sort by."""
     found = NUMBER.search(file.stem)
-    return (int(found[0]) if found else -1), file.name
+    return NUMBER.sub("", file.stem), (int(found[0]) if found else -1), file.name
 
 
 def refuse_several_zooms(folder: Path, placed: Mapping[str, PlacedPicture]) -> None:

@@ -76,6 +76,7 @@ def measure_scene(
     refuse_without_test_views(scene)
     methods = methods_of(subject, entries, choices, settings, plugins, scene)
     zooms = zooms_of(subject, methods, settings.evaluation.zoom)
+    refuse_unmeasurable(methods, zooms, scene)
     scene = with_shared_views(scene, methods, zooms) if choices.partial else scene
     for method in methods:
         log_notes(method, zooms, scene)
@@ -128,7 +129,7 @@ def methods_of(
     def model(entry: Entry) -> Model:
         return opened_model(entry, subject.overrides, settings, plugins, scene)
 
-    depth = model(Entry(name="--depth", path=choices.depth)) if choices.depth else None
+    depth = model(Entry(name="--depth", path=model_at(choices.depth))) if choices.depth else None
     matcher = matcher_for(scene, settings.evaluation, subject, choices)
 
     def method(entry: Entry) -> Method:
@@ -147,6 +148,13 @@ def place_for(path: Path, scene: str) -> Path:
     return place
 
 
+def model_at(path: Path) -> Path:
+    """Returns the path of --depth; InputError: it is no run and no splat file."""
+    if not is_model(path):
+        raise InputError(f"--depth {path} is neither a run folder nor a splat file ({READABLE}): give one of these")
+    return path
+
+
 def matcher_for(scene: Scene, options: EvalOptions, subject: Subject, choices: Choices) -> Matcher:
     """Returns what finds views and zooms of pictures."""
     aliases = {view: bare(file) for view, file in (subject.aliases or {}).items()}
@@ -156,12 +164,16 @@ def matcher_for(scene: Scene, options: EvalOptions, subject: Subject, choices: C
 
 
 def ordered_views(path: Path, names: Mapping[str, View]) -> list[View]:
-    """Returns the views that a list names; InputError: it names another."""
+    """Returns the views that a list names; InputError: it names another, or one twice."""
     listed = read_order(path)
     unknown = [name for name in listed if bare(name) not in names]
     if unknown:
         raise InputError(f"--order {path}: '{unknown[0]}' is no test view; the first is '{next(iter(names))}'")
-    return [names[bare(name)] for name in listed]
+    views = [names[bare(name)] for name in listed]
+    twice = next((name for name, view in zip(listed, views, strict=True) if views.count(view) > 1), "")
+    if twice:
+        raise InputError(f"--order {path} names '{twice}' twice: name the view of each picture once, in their order")
+    return views
 
 
 def zooms_of(subject: Subject, methods: Sequence[Method], chosen: Sequence[float]) -> list[float]:
@@ -171,6 +183,15 @@ def zooms_of(subject: Subject, methods: Sequence[Method], chosen: Sequence[float
         return sorted(set(chosen))
     found = {factor for method in methods for factor in method.factors() or ()}
     return sorted(found or subject.prepared_zooms or chosen)
+
+
+def refuse_unmeasurable(methods: Sequence[Method], zooms: Sequence[float], scene: Scene) -> None:
+    """Raises InputError if no method has a picture, and no photo allows one, at any of the zooms."""
+    cameras = (method.camera(view, zoom) for method in methods for zoom in zooms for view in scene.test)
+    if all(camera is None for camera in cameras):
+        raise InputError(
+            f"no method has a picture at {listed(zooms)}: choose other zooms by eval.zoom, or leave it out"
+        )
 
 
 def with_shared_views(scene: Scene, methods: Sequence[Method], zooms: Sequence[float]) -> Scene:

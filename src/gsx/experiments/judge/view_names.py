@@ -1,5 +1,6 @@
 """Names by which pictures may call a test view, and lists of views that programs write."""
 
+import logging
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,6 +11,8 @@ from gsx.core.data.scene import View
 from gsx.core.errors import InputError
 from gsx.core.files import read_json
 from gsx.experiments.reports.pictures import file_names
+
+logger = logging.getLogger(__name__)
 
 SUFFIX = re.compile(r"\.(png|jpe?g|exr|npy|webp|tiff?|bmp)$", re.IGNORECASE)
 ORDERS = ("test_views.txt", "cameras.json")
@@ -47,9 +50,18 @@ def order_near(folder: Path, names: Mapping[str, View]) -> tuple[Path, list[View
     """Returns the list of views next to pictures or above them, if its first entries name test views; None: none."""
     for place in (folder, *folder.absolute().parents[:LEVELS]):
         for name in ORDERS:
-            if (path := place / name).is_file() and (order := leading_views(read_order(path), names)):
+            if (path := place / name).is_file() and (order := leading_views(order_if_any(path), names)):
                 return path, order
     return None
+
+
+def order_if_any(path: Path) -> list[str]:
+    """Reads a list that happens to stand near pictures; it may be another file of that name: a warning, no views."""
+    try:
+        return read_order(path)
+    except InputError as error:
+        logger.warning("%s; the file is left out", error)
+        return []
 
 
 def leading_views(listed: Iterable[str], names: Mapping[str, View]) -> list[View]:
@@ -69,12 +81,13 @@ def read_order(path: Path) -> list[str]:
     Raises:
         InputError: the file is none of these.
     """
-    if path.suffix.lower() != ".json":
-        return [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
     try:
+        if path.suffix.lower() != ".json":
+            return [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
         content = read_json(path)
     except (OSError, ValueError) as error:
-        raise InputError(f"'{path}' cannot be read ({error}): give a list of views, one name a line") from None
+        reason = (error.strerror or error) if isinstance(error, OSError) else error
+        raise InputError(f"'{path}' cannot be read ({reason}): give a list of views, one name a line") from None
     entries = content.get("frames") if isinstance(content, dict) else content
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"'{path}' lists no cameras: give 3D-GS's cameras.json, a transforms.json, or one name a line")
