@@ -45,7 +45,7 @@ def ssim(
     """Returns the mean SSIM, in [-1, 1], over windows around pixels that count (None: all); nan for no pixels.
 
     Variants differ at borders. `inria`: zero padding, as 3D-GS. `torchmetrics`: reflected borders (repeated in narrow
-    images), as torchmetrics since 1.5. `valid`: only windows inside the image, as the original SSIM.
+    images), as torchmetrics since 1.4.2. `valid`: only windows inside the image, as the original SSIM.
     """
     if variant not in SSIM_VARIANTS:
         raise ValueError(f"SSIM variant '{variant}' is unknown; choose from {', '.join(SSIM_VARIANTS)}")
