@@ -68,7 +68,10 @@ def sorted_words(words: list[str]) -> tuple[list[tuple[str, Path]], list[Path], 
         else:
             methods.append((name, existing_path(name, value)))
     if not methods:
-        raise ConfigError("gsx judge needs at least one method: give NAME=PATH, for example ours=renders")
+        raise ConfigError(
+            "gsx judge needs at least one method: give NAME=PATH, for example ours=renders. Names "
+            f"of settings ({', '.join(SETTINGS[:5])} ...) cannot be names of methods"
+        )
     return methods, folders, overrides
 
 

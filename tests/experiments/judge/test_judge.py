@@ -198,7 +198,7 @@ def test_peculiar_files_are_read_and_stated(subject: Subject, tmp_path: Path) ->
         writer(tmp_path / "odd" / Path(view.name).stem, noisy(truth, 10))
     (method,) = judged(tmp_path / "out", f"a={tmp_path / 'odd'}", *subject.words)["results"][0]["methods"]
     text = "; ".join(method["notes"])
-    assert "1 pictures: 16 bits, rounded to 8" in text
+    assert "1 picture: 16 bits, rounded to 8" in text
     assert "transparent" in text
     assert "float32 display values" in text
     assert method["zoom"]["1"]["psnr"] > 25

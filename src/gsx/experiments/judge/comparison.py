@@ -10,15 +10,16 @@ from typing import Any
 
 from gsx import __version__
 from gsx.core.errors import ConfigError, InputError, command
-from gsx.core.files import read_json, replace_text, write_json
+from gsx.core.files import replace_text, write_json
 from gsx.core.plugins import Plugins
 from gsx.engine.cache import source_revision
 from gsx.experiments.judge.methods import Entry
 from gsx.experiments.judge.page import page_of
+from gsx.experiments.judge.prepared_scenes import prepared_subject
 from gsx.experiments.judge.scene_figures import Choices, Subject, measure_scene
 from gsx.experiments.judge.summary import PLACE, baseline_of, named_methods, over_scenes, rows_of, view_rows
 from gsx.experiments.judge.tables import as_csv, as_text
-from gsx.experiments.prepare.whole_folder import MANIFEST, whole_folder
+from gsx.experiments.prepare.whole_folder import whole_folder
 from gsx.experiments.runs.compose import Compositions
 
 logger = logging.getLogger(__name__)
@@ -129,26 +130,6 @@ def measuring_words(overrides: Sequence[str], protocol: str, plugins: Plugins) -
         measuring, known = compositions.protocol(protocol).measuring, compositions.keys(overrides)
     fitting = {key: value for key, value in measuring.items() if key in known and key != "eval.zoom"}
     return [f"{key}={json.dumps(value)}" for key, value in fitting.items()]
-
-
-def prepared_subject(folder: Path, overrides: Sequence[str]) -> Subject:
-    """Reads the manifest of a folder that `gsx prepare` wrote; `overrides`: further settings.
-
-    Raises:
-        InputError: it is unreadable.
-    """
-    file = folder / MANIFEST
-    try:
-        manifest: dict[str, Any] = read_json(file)
-        return Subject(
-            overrides=(*map(str, manifest["overrides"]), *overrides),
-            own=len(manifest["overrides"]),
-            name=str(manifest["scene"]),
-            prepared_zooms=tuple(map(float, manifest["zooms"])),
-            aliases={str(view["name"]): str(view["file"]) for view in manifest["test"]},
-        )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"'{file}' cannot be read ({error}): prepare the scene again by gsx prepare") from None
 
 
 def subjects_of(folders: Sequence[Path], words: Sequence[str], overrides: Sequence[str]) -> list[Subject]:

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError, nearest
+from gsx.experiments.judge.counts import counted
 from gsx.experiments.judge.layouts import PictureSet
 from gsx.experiments.judge.picture_files import Header, read_header
 from gsx.experiments.judge.view_names import order_near
@@ -91,7 +92,7 @@ class Matcher:
                 return self.by_number(pictures)
         self.refuse_missing(pictures, named)
         extra = len(pictures.files) - len(named)
-        notes = [f"{extra} pictures are of no test view and are left out"] if extra else []
+        notes = [f"of no test view and left out: {counted(extra, 'picture')}"] if extra else []
         return named, notes, False
 
     def has_names(self, pictures: PictureSet, named: Mapping[View, Path]) -> bool:
@@ -128,9 +129,9 @@ class Matcher:
 
     def in_order(self, pictures: PictureSet, views: Sequence[View], where: str) -> dict[View, Path]:
         """Returns numbered pictures by view; InputError: their number is not that of the views listed `where`."""
-        if len(pictures.files) != len(views):
+        if (count := len(pictures.files)) != len(views):
             raise InputError(
-                f"'{pictures.folder}' holds {len(pictures.files)} pictures, but there are {len(views)} test views "
+                f"'{pictures.folder}' holds {counted(count, 'picture')}, but there are {len(views)} test views "
                 f"{where}, and the pictures do not have the names of views ({self.example(pictures)}): name them as "
                 "the views, or give --order FILE with the name of each picture's view, one a line"
             )
@@ -218,6 +219,6 @@ def rounding_notes(placed: Mapping[str, PlacedPicture], views: Mapping[str, View
         return []
     own, ours = placed[odd[0]].header.size, views[odd[0]].camera.zoom(placed[odd[0]].factor).size
     return [
-        f"{len(odd)} pictures are rounded to another size, such as {own[0]} x {own[1]} px instead of {ours[0]} x "
-        f"{ours[1]}: their photos are reduced to that size"
+        f"rounded to another size: {counted(len(odd), 'picture')}, such as {own[0]} x {own[1]} px instead of "
+        f"{ours[0]} x {ours[1]}; photos are reduced to that size"
     ]

@@ -1,6 +1,5 @@
 """Methods: pictures in folders, and models that are rendered here."""
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,13 +17,12 @@ from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluated_renders import EvaluatedRenders
 from gsx.experiments.evaluation.warp import Surface
 from gsx.experiments.evaluation.zoomed import Zoomed
+from gsx.experiments.judge.counts import counted
 from gsx.experiments.judge.layouts import layout_of
 from gsx.experiments.judge.matching import Matcher, Placed, PlacedPicture
 from gsx.experiments.judge.picture_files import read_picture
 from gsx.experiments.judge.resemblance import refuse_other_order
 from gsx.scenes.origin import relative_camera
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +75,13 @@ class PictureFolder:
         self.entry, self.model, self.background = entry, model, scene.background
         layout = layout_of(entry.path)
         placed = [matcher.place(pictures) for pictures in layout.sets]
-        self.program, self.pictures = layout.program, by_zoom(entry, placed)
-        self.notes = [*layout.notes, *dict.fromkeys(note for one in placed for note in one.notes), *self.peculiar()]
+        self.program, self.pictures, twice = layout.program, *by_zoom(placed)
+        self.notes = [
+            *layout.notes,
+            *twice,
+            *dict.fromkeys(note for one in placed for note in one.notes),
+            *self.peculiar(),
+        ]
         for one in placed:
             if one.by_order:
                 refuse_other_order(entry.path, one.pictures, scene)
@@ -88,7 +91,7 @@ class PictureFolder:
         headers = [one.header for pictures in self.pictures.values() for one in pictures.values()]
         for remark in dict.fromkeys(remark for header in headers for remark in header.remarks):
             count = sum(remark in header.remarks for header in headers)
-            yield f"{'all' if count == len(headers) else count} pictures: {remark}"
+            yield f"{'all pictures' if count == len(headers) else counted(count, 'picture')}: {remark}"
 
     def factors(self) -> list[float] | None:
         """Returns the zooms of the pictures."""
@@ -124,15 +127,16 @@ class PictureFolder:
         return {"kind": "pictures", "layout": self.program, "pictures": counts}
 
 
-def by_zoom(entry: Entry, placed: Sequence[Placed]) -> dict[float, dict[str, PlacedPicture]]:
-    """Returns pictures by zoom and view; of two folders at one zoom the first counts, with a warning."""
+def by_zoom(placed: Sequence[Placed]) -> tuple[dict[float, dict[str, PlacedPicture]], list[str]]:
+    """Returns pictures by zoom and view, and remarks: of two folders at one zoom the first counts."""
     out: dict[float, dict[str, PlacedPicture]] = {}
+    remarks: list[str] = []
     for one in placed:
         factor = next(iter(one.pictures.values())).factor
         if factor in out:
-            logger.warning("%s has two folders of pictures at x%g: the first is measured", entry.path, factor)
+            remarks.append(f"two folders hold pictures at x{factor:g} by their size: the first is measured")
         out.setdefault(factor, one.pictures)
-    return out
+    return out, remarks
 
 
 class Model:

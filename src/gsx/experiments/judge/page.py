@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gsx import __version__
+from gsx.experiments.judge.counts import counted
 from gsx.experiments.judge.summary import Row
 from gsx.experiments.judge.tables import HEADINGS, columns, gap, number
 from gsx.experiments.reports.page import template
@@ -26,11 +27,6 @@ def page_of(content: Mapping[str, Any], rows: Sequence[Row], means: Sequence[Row
         means=[cells(row, keys) for row in means],
         headings=[HEADINGS.get(key, key) for key in keys],
     )
-
-
-def counted(number: int, noun: str) -> str:
-    """Returns a number with its noun."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def block_of(result: Mapping[str, Any], rows: Sequence[Row]) -> dict[str, Any]:

@@ -45,6 +45,8 @@ class Subject:
     """Zooms for which a scene was prepared; models are measured at them unless pictures have others."""
     aliases: Mapping[str, str] | None = None
     """Names of pictures by view, as `gsx prepare` lists them."""
+    prepared: str = ""
+    """Folder of `gsx prepare`; empty: there is none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +76,7 @@ def measure_scene(
     prepare_process(choose_device(settings.general.device), training=False)
     scene = load_scene(settings)
     refuse_without_test_views(scene)
+    refuse_other_views(subject, scene)
     methods = methods_of(subject, entries, choices, settings, plugins, scene)
     zooms = zooms_of(subject, methods, settings.evaluation.zoom)
     refuse_unmeasurable(methods, zooms, scene)
@@ -110,6 +113,18 @@ def refuse_without_test_views(scene: Scene) -> None:
     """Raises ConfigError if no view is held out."""
     if not scene.test:
         raise ConfigError("gsx judge compares with test views: choose another split than scene.split=none")
+
+
+def refuse_other_views(subject: Subject, scene: Scene) -> None:
+    """Raises InputError if a scene no longer has the test views that it was prepared with."""
+    now = {view.name for view in scene.test}
+    before = set(subject.aliases or now)
+    if before != now:
+        name = sorted(before ^ now)[0]
+        change = "holds out" if name in now else "no longer holds out"
+        raise InputError(
+            f"'{subject.prepared}' was prepared with other test views: the scene {change} '{name}': prepare it again"
+        )
 
 
 # -- methods -----------------------------------------------------------------------------------------------------------

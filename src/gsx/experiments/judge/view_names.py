@@ -91,6 +91,10 @@ def read_order(path: Path) -> list[str]:
     entries = content.get("frames") if isinstance(content, dict) else content
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"'{path}' lists no cameras: give 3D-GS's cameras.json, a transforms.json, or one name a line")
+    if unnamed := [number for number, entry in enumerate(entries, start=1) if not name_in(entry)]:
+        raise InputError(
+            f"'{path}': entry {unnamed[0]} has no img_name, file_path or name: give each its picture's name"
+        )
     return [name_in(entry) for entry in entries]
 
 
