@@ -26,13 +26,10 @@ from typing import Any
 
 import torch
 
-from gsx.builtin import plugins
 from gsx.core.files import read_json
-from gsx.experiments.runs.compose import compose
-from gsx.experiments.runs.load_scene import load_scene
 from measuring.curves import Point, steps_for
 from measuring.machine import commit, describe_machine, first_line, shown_command, told_load
-from measuring.opensplat import file_of, run_opensplat, write_scene
+from measuring.opensplat import file_of, kept_scene, run_opensplat
 from measuring.panels import panels
 from measuring.quality_tables import REACHED_ZOOMS, Row, curve_of, place_of, reached, runs_section
 from measuring.results import Section, read_sections, text_table, write_results
@@ -150,11 +147,7 @@ def opensplat_words(arm: str, steps: int) -> list[str]:
 
 def opensplat_scene(bench: Bench, scene: str) -> Path:
     """Writes the scene in OpenSplat's form unless it is there; returns its folder."""
-    folder = bench.folder("scene", scene)
-    if not (folder / "whole").is_file():
-        write_scene(load_scene(compose(bench.scene_words(scene), plugins())), folder)
-        (folder / "whole").touch()
-    return folder
+    return kept_scene(bench.scene_words(scene), bench.folder("scene", scene))
 
 
 # -- times and figures of a run ----------------------------------------------------------------------------------------

@@ -7,10 +7,13 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from gsx.builtin import plugins
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene, View
 from gsx.core.files import write_json
 from gsx.experiments.prepare.colmap_files import write_model
+from gsx.experiments.runs.compose import compose
+from gsx.experiments.runs.load_scene import load_scene
 from measuring.runs import clock_of
 
 WRAPPER = """\
@@ -22,6 +25,8 @@ sys.exit(code)
 """Small process that starts a program: Linux counts the starting process's memory in the peak of its child."""
 IMAGES, MODEL = "images", "sparse/0"
 """Folders of the photos and of the COLMAP model."""
+WHOLE = "whole"
+"""File in the folder of a scene that is written to its end."""
 CENTRE = 0.01
 """Distance of a principal point from the centre that OpenSplat's CPU projection may ignore, px."""
 
@@ -42,6 +47,14 @@ def write_scene(scene: Scene, folder: Path) -> Path:
         write_image(folder / IMAGES / name, view.picture())
     cameras = [(name, view.camera) for name, view in zip(names, scene.train, strict=True)]
     write_model(folder / MODEL, cameras, scene.points, scene.origin)
+    return folder
+
+
+def kept_scene(words: Sequence[str], folder: Path) -> Path:
+    """Writes the scene that overrides choose by `write_scene` unless it is there; returns its folder."""
+    if not (folder / WHOLE).is_file():
+        write_scene(load_scene(compose(words, plugins())), folder)
+        (folder / WHOLE).touch()
     return folder
 
 
