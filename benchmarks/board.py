@@ -140,8 +140,9 @@ def warm_up(bench: Bench, method: str, scene: str) -> None:
 
 def trained(bench: Bench, method: str, scene: str) -> Row:
     """Trains a method of gsx until a run keeps the minutes; returns the figures of the run that kept them best."""
-    warm_up(bench, next(iter(METHODS)), scene)
-    warm_up(bench, method, scenes_at_hand(bench.options)[0])
+    if not clock_of(bench.folder(method, scene, 1)).is_file():
+        warm_up(bench, next(iter(METHODS)), scene)
+        warm_up(bench, method, scenes_at_hand(bench.options)[0])
     row, kept = planned(bench, method, scene), list[Row]()
     for attempt in range(2, ATTEMPTS + 2):
         kept += [] if row["compiled"] else [row]
