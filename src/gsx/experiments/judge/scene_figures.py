@@ -2,7 +2,7 @@
 
 import logging
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -295,10 +295,3 @@ def result_of(measured: Measured, scene: Scene) -> dict[str, Any]:
         "zoom": measured.means(),
         "views": measured.views,
     }
-
-
-def notes_in(results: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str, str]]:
-    """Yields scene, method and note."""
-    for result in results:
-        for method in result["methods"]:
-            yield from ((result["named"], method["name"], note) for note in method["notes"])
