@@ -10,7 +10,7 @@ from gsx.experiments.runs.overrides import is_override, key_of
 
 SETTINGS = (
     *("scene", "dataset", "data_root", "protocol", "eval", "metrics", "device", "seed", "axes"),
-    *("rasterizer", "regenerator/upscale@eval.competitor"),
+    *("rasterizer", "regenerator"),
 )
 """Settings of scene and figures; other words NAME=PATH are methods."""
 SCENE = ("scene=", "dataset=")
@@ -77,8 +77,7 @@ def sorted_words(words: list[str]) -> tuple[list[tuple[str, Path]], list[Path], 
 
 def is_setting(word: str) -> bool:
     """Return whether a word sets the scene or how figures are measured."""
-    key = key_of(word)
-    return is_override(word) and (key in SETTINGS or key.partition(".")[0] in SETTINGS)
+    return is_override(word) and key_of(word) in SETTINGS
 
 
 def existing_folder(word: str) -> Path:

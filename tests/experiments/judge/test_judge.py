@@ -124,6 +124,14 @@ def test_several_prepared_scenes_and_protocols(subject: Subject, tmp_path: Path,
     assert "mean of 2" in capsys.readouterr().out
 
 
+def test_another_competitor_is_a_setting(subject: Subject, pictures: Path, tmp_path: Path) -> None:
+    words = [word for word in subject.words if not word.startswith("eval.competitor")]
+    words = [f"noisy={pictures}", *words, "regenerator/upscale@eval.competitor=lanczos"]
+    (result,) = judged(tmp_path / "out", *words)["results"]
+    assert result["competitor"]["name"] == "lanczos"
+    assert "upscaled_psnr" in result["methods"][0]["zoom"]["2"]
+
+
 # -- matching ----------------------------------------------------------------------------------------------------------
 
 
