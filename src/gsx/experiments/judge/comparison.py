@@ -19,7 +19,7 @@ from gsx.experiments.judge.prepared_scenes import prepared_subject
 from gsx.experiments.judge.scene_figures import Choices, Subject, measure_scene
 from gsx.experiments.judge.summary import PLACE, baseline_of, named_methods, over_scenes, rows_of, view_rows
 from gsx.experiments.judge.tables import as_csv, as_text
-from gsx.experiments.prepare.whole_folder import whole_folder
+from gsx.experiments.prepare.whole_folder import refuse_occupied, whole_folder
 from gsx.experiments.runs.compose import Compositions
 
 logger = logging.getLogger(__name__)
@@ -27,8 +27,6 @@ logger = logging.getLogger(__name__)
 FORMAT = 1
 """Version of comparison.json."""
 PAGE, RESULTS, FIGURES, VIEWS, PICTURES = "comparison.html", "comparison.json", "figures.csv", "views.csv", "pictures"
-CACHE = "scene.cache_gb=0.5"
-"""Each photo is read once at each size: a larger cache gains nothing."""
 
 
 def compare_methods(
@@ -57,10 +55,10 @@ def compare_methods(
         ConfigError, InputError: a setting, a scene or a method cannot be measured; nothing is written.
     """
     entries = numbered(entries)
-    refuse_unknown_baseline(against, entries)
+    baseline = baseline_of(list(dict.fromkeys(entry.name for entry in entries)), against)
     refuse_equal_names(subjects)
     place = Path("outputs") / "comparisons" / f"{datetime.now():%Y-%m-%d_%H-%M-%S}" if to is None else to
-    refuse_full(place)
+    refuse_occupied(place)
     with whole_folder(place) as folder:
         (folder / PICTURES).mkdir()
         results = []
@@ -70,7 +68,6 @@ def compare_methods(
             measured = with_protocol(subject, name, plugins)
             found = measure_scene(measured, entries, choices, plugins, folder / PICTURES, f"{number}")
             results.append({"protocol_name": name, **found})
-        baseline = baseline_of(results, against)
         lines = write_results(folder, results, baseline, words)
     return place / PAGE, lines
 
@@ -85,11 +82,6 @@ def numbered(entries: Sequence[Entry]) -> list[Entry]:
     return out
 
 
-def refuse_unknown_baseline(against: str, entries: Sequence[Entry]) -> None:
-    """Raises InputError for --against with a name of no method."""
-    baseline_of([{"methods": [{"name": entry.name} for entry in entries]}], against)
-
-
 def refuse_equal_names(subjects: Sequence[Subject]) -> None:
     """Raises InputError if two prepared scenes have one name."""
     names = [subject.name for subject in subjects]
@@ -97,16 +89,8 @@ def refuse_equal_names(subjects: Sequence[Subject]) -> None:
         raise InputError(f"two of the prepared folders hold a scene called '{twice}': compare them one by one")
 
 
-def refuse_full(place: Path) -> None:
-    """Raises InputError for a place that is not free."""
-    if place.is_dir() and any(place.iterdir()):
-        raise InputError(f"--to {place} holds other files: choose a new folder")
-    if place.exists() and not place.is_dir():
-        raise InputError(f"--to {place} is a file: choose a new folder")
-
-
 def with_protocol(subject: Subject, protocol: str, plugins: Plugins) -> Subject:
-    """Returns a scene that a named protocol measures, with a small cache; empty: by the settings as they are.
+    """Returns a scene that a named protocol measures; empty: by the settings as they are.
 
     Its settings of sizes and splits do not count: pictures have their size, and the scene its test views.
 
@@ -114,14 +98,7 @@ def with_protocol(subject: Subject, protocol: str, plugins: Plugins) -> Subject:
         ConfigError: there is no such protocol.
     """
     measuring = [] if not protocol else measuring_words(subject.overrides, protocol, plugins)
-    return replace(subject, overrides=(*with_small_cache(subject.overrides), *measuring))
-
-
-def with_small_cache(overrides: Sequence[str]) -> list[str]:
-    """Returns settings with a small cache of photos, unless they set one or the scene has none."""
-    of_photos = any(word.startswith("scene.path=") for word in overrides)
-    chosen = any(word.startswith("scene.cache_gb=") for word in overrides)
-    return [*overrides, *([CACHE] if of_photos and not chosen else [])]
+    return replace(subject, overrides=(*subject.overrides, *measuring))
 
 
 def measuring_words(overrides: Sequence[str], protocol: str, plugins: Plugins) -> list[str]:

@@ -174,7 +174,7 @@ def only_pictures(paths: Sequence[Path]) -> Iterator[Path]:
 
 
 def partners(files: Sequence[Path], folder: Path, photos: Path) -> dict[Path, Path]:
-    """Returns the photos that have the names of renders below another folder, whatever their suffix."""
+    """Returns the photos that have the names of renders below another folder, with any suffix."""
     known = {path.relative_to(photos).with_suffix(""): path for path in pictures_below(photos)}
     keys = {file: file.relative_to(folder).with_suffix("") for file in files}
     return {file: known[key] for file, key in keys.items() if key in known}

@@ -1,20 +1,20 @@
 """Assigns pictures to test views and zooms."""
 
-import logging
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
+from torch import Tensor
+
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError, nearest
+from gsx.core.shapes import Float
 from gsx.experiments.judge.counts import counted
 from gsx.experiments.judge.layouts import PictureSet
-from gsx.experiments.judge.picture_files import Header, read_header
+from gsx.experiments.judge.picture_files import Header, read_header, read_picture
 from gsx.experiments.judge.view_names import order_near
-
-logger = logging.getLogger(__name__)
 
 NUMBER = re.compile(r"\d+$")
 """Number at the end of a picture's name."""
@@ -35,6 +35,18 @@ class PlacedPicture:
     truth: Path | None = None
     """The photo that the program compared with, if it wrote one."""
     side_by_side: bool = False
+
+    def render(self, background: Float[Tensor, "3"]) -> Float[Tensor, "3 H W"]:
+        """Reads the render, over a background where it is transparent."""
+        whole = read_picture(self.file, background)
+        return whole[..., whole.shape[2] // 2 :] if self.side_by_side else whole
+
+    def photo(self, background: Float[Tensor, "3"]) -> Float[Tensor, "3 H W"] | None:
+        """Reads the photo that the program compared with; None: it wrote none."""
+        if self.side_by_side:
+            whole = read_picture(self.file, background)
+            return whole[..., : whole.shape[2] // 2]
+        return None if self.truth is None else read_picture(self.truth, background)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,6 @@ from gsx.experiments.evaluation.zoomed import Zoomed
 from gsx.experiments.judge.counts import counted
 from gsx.experiments.judge.layouts import layout_of
 from gsx.experiments.judge.matching import Matcher, Placed, PlacedPicture
-from gsx.experiments.judge.picture_files import read_picture
 from gsx.experiments.judge.resemblance import refuse_other_order
 from gsx.scenes.origin import relative_camera
 
@@ -110,16 +109,12 @@ class PictureFolder:
         """Reads a picture, over the scene's background where it is transparent."""
         placed = self.placed(view, factor)
         assert placed is not None, "`camera` says which pictures there are"
-        whole = read_picture(placed.file, self.background)
-        return whole[..., whole.shape[2] // 2 :] if placed.side_by_side else whole
+        return placed.render(self.background)
 
     def truth_of_program(self, view: View, factor: float) -> Float[Tensor, "3 H W"] | None:
         """Reads the photo that the program compared with; None: it wrote none."""
         placed = self.placed(view, factor)
-        if placed is None or not (placed.side_by_side or placed.truth):
-            return None
-        whole = read_picture(placed.truth or placed.file, self.background)
-        return whole[..., : whole.shape[2] // 2] if placed.side_by_side else whole
+        return placed.photo(self.background) if placed else None
 
     def facts(self) -> dict[str, Any]:
         """Returns the program whose layout the folder has, and the number of pictures by zoom."""

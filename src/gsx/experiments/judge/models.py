@@ -1,6 +1,5 @@
 """Run folders and splat files as methods."""
 
-import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,8 +23,6 @@ from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import composition_of
 from gsx.formats.splat_files import read_splats
 from gsx.formats.suffixes import splat_file_at, suffix_of
-
-logger = logging.getLogger(__name__)
 
 SAME_POSE = 1e-3
 """Largest distance of two cameras of one view that is rounding, as a share of the scene's extent."""

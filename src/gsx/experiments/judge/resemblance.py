@@ -11,7 +11,6 @@ from gsx.core.data.scene import Scene, View
 from gsx.core.errors import InputError
 from gsx.core.shapes import Float
 from gsx.experiments.judge.matching import PlacedPicture
-from gsx.experiments.judge.picture_files import read_picture
 
 SIDE = 16
 """Width and height of the thumbnails that are compared, px."""
@@ -27,7 +26,7 @@ def refuse_other_order(folder: Path, pictures: Mapping[str, PlacedPicture], scen
     if len(views) < 2:
         return
     photos = torch.stack([thumbnail(view.image()) for view in views])
-    renders = torch.stack([thumbnail(render_in(pictures[view.name], scene)) for view in views])
+    renders = torch.stack([thumbnail(pictures[view.name].render(scene.background)) for view in views])
     errors = (renders[:, None] - photos[None]).square().flatten(2).mean(2)
     odd = (errors.min(1).values < CLEARLY * errors.diagonal()).nonzero()[:, 0].tolist()
     if len(odd) > MOST_SHARE * len(views):
@@ -44,12 +43,6 @@ def in_words(
         f"as {pictures[name].file.name}, taken for '{name}' and more like '{views[other].name}': give --order FILE "
         "with the name of each picture's view, one a line"
     )
-
-
-def render_in(picture: PlacedPicture, scene: Scene) -> Float[Tensor, "3 H W"]:
-    """Reads a picture without the photo next to it."""
-    whole = read_picture(picture.file, scene.background)
-    return whole[..., whole.shape[2] // 2 :] if picture.side_by_side else whole
 
 
 def thumbnail(picture: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 side side"]:

@@ -24,7 +24,7 @@ from gsx.experiments.judge.models import is_model, opened_model
 from gsx.experiments.judge.view_names import bare, names_of_views, read_order
 from gsx.experiments.runs.build import choose_device, prepare_process
 from gsx.experiments.runs.compose import compose
-from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.load_scene import load_scene, with_small_cache
 from gsx.experiments.runs.progress import Countdown
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.suffixes import READABLE
@@ -71,7 +71,7 @@ def measure_scene(
     Raises:
         ConfigError, InputError: a setting, the scene or a method cannot be measured.
     """
-    settings = compose(subject.overrides, plugins)
+    settings = with_small_cache(compose(subject.overrides, plugins))
     refuse_halves(settings.evaluation)
     prepare_process(choose_device(settings.general.device), training=False)
     scene = load_scene(settings)

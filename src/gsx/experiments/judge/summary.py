@@ -30,9 +30,8 @@ def named_methods(results: Results) -> list[str]:
     return list(dict.fromkeys(method["name"] for result in results for method in result["methods"]))
 
 
-def baseline_of(results: Results, name: str) -> str:
+def baseline_of(known: Sequence[str], name: str) -> str:
     """Returns the method that others are compared with: the first, or that of a name; InputError: there is none."""
-    known = named_methods(results)
     if name and name not in known:
         raise InputError(
             f"--against {name}: there is no such method, choose from {', '.join(known)}.{nearest(name, known)}"

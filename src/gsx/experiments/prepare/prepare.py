@@ -3,7 +3,6 @@
 import json
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,16 +28,13 @@ from gsx.experiments.prepare.transforms_file import write_transforms
 from gsx.experiments.prepare.whole_folder import MANIFEST, is_prepared, refuse_inside, refuse_occupied, whole_folder
 from gsx.experiments.prepare.zoom_cameras import Zoomed, write_zoom, zoom_name
 from gsx.experiments.runs.compose import compose
-from gsx.experiments.runs.load_scene import load_scene
+from gsx.experiments.runs.load_scene import load_scene, with_small_cache
 from gsx.experiments.runs.progress import Countdown
-from gsx.experiments.runs.settings import Settings
 
 logger = logging.getLogger(__name__)
 
 FORMAT = 1
 """Version of the folder's layout."""
-CACHE_GB = 0.25
-"""Memory for decoded photos, 10^9 bytes: some neighbours, for starting points by stereo."""
 README, NAMES = "README.txt", "test_views.txt"
 
 Advance = Callable[[float, str], None]
@@ -63,7 +59,7 @@ def prepare(
         ConfigError: a setting is wrong.
         InputError: the scene cannot be loaded, `to` holds something else, or a zoom has no truth.
     """
-    refuse_occupied(to)
+    refuse_occupied(to, prepared=True)
     settings = with_small_cache(compose(words, plugins))
     refuse_inside(to, getattr(settings.scene.options, "path", ""))
     scene = load_scene(settings)
@@ -81,15 +77,6 @@ def prepare(
         write_folder(folder, content, manifest, Countdown("preparing", content.work()).advance)
     logger.info("prepared %d training and %d test views of scene %s", len(scene.train), len(scene.test), scene.name)
     return to
-
-
-def with_small_cache(settings: Settings) -> Settings:
-    """Return settings that keep few decoded photos: each is written once."""
-    chosen = settings.scene
-    if not hasattr(chosen.options, "cache_gb"):  # of a plugin
-        return settings
-    least = min(chosen.options.cache_gb, CACHE_GB)
-    return replace(settings, scene=replace(chosen, options=replace(chosen.options, cache_gb=least)))
 
 
 def manifest_of(content: Prepared, options: EvalOptions, words: Sequence[str]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from gsx.formats.ply import write_ply
 
 FILE, POINTS = "transforms.json", "points.ply"
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From axes x right, y up, z back to x right, y down, z forward."""
+"""Turn of axes x right, y up, z back to x right, y down, z forward."""
 UNCHANGED = np.eye(4)[:3].tolist()
 
 

@@ -35,10 +35,10 @@ def whole_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def refuse_occupied(path: Path) -> None:
-    """Raise InputError for a path that is neither free, nor an empty folder, nor a prepared one."""
+def refuse_occupied(path: Path, prepared: bool = False) -> None:
+    """Raise InputError for a path that is neither free nor an empty folder; `prepared`: nor a prepared one."""
     if path.is_dir():
-        if any(path.iterdir()) and not (path / MANIFEST).is_file():
+        if any(path.iterdir()) and not (prepared and (path / MANIFEST).is_file()):
             raise InputError(f"--to {path} holds other files: choose a new folder")
     elif path.exists() or path.is_symlink():
         raise InputError(f"--to {path} is a file: choose a new folder")

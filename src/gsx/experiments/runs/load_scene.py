@@ -22,6 +22,8 @@ from gsx.scenes.origin import around_origin, origin_of
 from gsx.scenes.posed import SAME_PLACE
 from gsx.scenes.stereo import add_stereo_points
 
+CACHE_GB = 0.25
+"""Memory for decoded photos that are used once, 10^9 bytes: some neighbours, for starting points by stereo."""
 HIDDEN_SHARE, LARGEST_EXTENT = 0.02, 1e3
 """Largest share of points hidden by near planes, and extent, of units that 3D-GS expects."""
 
@@ -58,6 +60,15 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
         generator = torch.Generator().manual_seed(derived_seed("stereo", settings.general.seed))
         scene = add_stereo_points(scene, count, generator)
     return scene
+
+
+def with_small_cache(settings: Settings) -> Settings:
+    """Return settings that keep few decoded photos: each is used once."""
+    chosen = settings.scene
+    if not hasattr(chosen.options, "cache_gb"):  # of a plugin
+        return settings
+    least = min(chosen.options.cache_gb, CACHE_GB)
+    return replace(settings, scene=replace(chosen, options=replace(chosen.options, cache_gb=least)))
 
 
 def refuse_absent_scene(settings: Settings) -> None:

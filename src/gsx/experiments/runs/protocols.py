@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsx.core.errors import ConfigError
 from gsx.core.options import flattened
-from gsx.experiments.runs.overrides import parse_overrides
+from gsx.experiments.runs.overrides import key_of, parse_overrides
 
 GROUP = "protocol"
 """Group of named protocols on the command line."""
@@ -86,7 +86,7 @@ def content_of(name: str) -> dict[str, Any]:
 
 def chosen_protocols(overrides: Sequence[str]) -> Iterator[NamedProtocol]:
     """Yields the protocols that overrides choose."""
-    for override in parse_overrides(overrides):
+    for override in parse_overrides([word for word in overrides if key_of(word) == GROUP]):
         if override.key_or_group == GROUP:
             yield named_protocol(str(override.value()))
 
