@@ -1,4 +1,4 @@
-"""Deadline: a run that falls behind its planned time skips steps, and keeps the end of its schedule.
+"""Deadline: a run that falls behind its planned time skips steps, a few of each window, and keeps its schedule.
 
 `minutes=N` plans a run and sets these options. While the run keeps to its plan, the clock changes nothing.
 """
@@ -20,12 +20,14 @@ from gsx.modules.milestones import last_milestone
 
 logger = logging.getLogger(__name__)
 
-MEASURED = 8
-"""Steps of the last stretch whose pace is measured before any are skipped there."""
+WINDOWS, SHORTEST = 50, 10
+"""Windows of a run, each of which may skip its first steps, and the steps of the shortest one."""
+RECENT = 4
+"""Windows whose pace is that of the rest."""
 SLACK = 0.03
-"""Share of the planned time by which the last stretch may be late before steps are skipped there."""
-LEAST_END = 0.5
-"""Share of the last stretch that is always taken."""
+"""Share of the time by which a run may be late before it skips steps."""
+LEAST, LEAST_END = 0.1, 0.5
+"""Least share of the steps that a window takes: before the last stretch, and in it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,13 +75,13 @@ class Deadline(TrainingModule):
         self.active = options.seconds > 0 and options.steps == context.iterations and not options.skip
         """True: the clock may skip steps."""
         self.last_stretch = round(options.to * context.iterations)
-        """First step of the last stretch."""
+        """Step before the last stretch, which is always taken."""
         self.listed = dict(zip(options.skip[::2], options.skip[1::2], strict=True))
         """Last step of each stretch to skip by its first one."""
         self.skipped: list[int] = []
         """Steps skipped so far."""
-        self.since: tuple[int, float] | None = None
-        """Step and seconds of training since which the pace of the last stretch is measured."""
+        self.marks: list[tuple[int, float, float]] = []
+        """First step of each of the last windows, seconds of training, and planned ones without skipped steps."""
 
     # -- hooks ---------------------------------------------------------------------------------------------------------
 
@@ -91,7 +93,7 @@ class Deadline(TrainingModule):
             return {}
         self.skipped += range(first, last + 1)
         clocked = self.log_late(run, first, last) if self.active else {}
-        run.step, self.since = last, None
+        run.step = last
         return {"steps_left_out": float(last + 1 - first)} | clocked
 
     def log_late(self, run: Run, first: int, last: int) -> dict[str, float]:
@@ -110,8 +112,7 @@ class Deadline(TrainingModule):
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Restores a checkpoint."""
-        if tensors:
-            self.skipped = tensors["skipped"].tolist()
+        self.skipped = tensors["skipped"].tolist() if tensors else []
 
     def plan(self, run: Run) -> dict[str, Any]:
         """Returns the deadline and the steps that may be skipped."""
@@ -136,41 +137,42 @@ class Deadline(TrainingModule):
     # -- rules ---------------------------------------------------------------------------------------------------------
 
     def last_late(self, run: Run) -> int:
-        """Returns the last step to skip now; 0: the run is in time, or must act at a later milestone first."""
-        before_end = run.step < self.last_stretch - 1
-        if run.step < self.first_allowed(run, self.last_stretch if before_end else self.context.iterations):
+        """Returns the last step to skip now; 0: the run is in time, or no window begins here."""
+        window = max(SHORTEST, math.ceil(self.context.iterations / WINDOWS))
+        if run.step % window:
             return 0
-        return self.late_before_end(run) if before_end else self.late_at_end(run)
+        self.mark(run)
+        before_end = run.step < self.last_stretch
+        stop = self.last_stretch if before_end else self.context.iterations
+        if run.step < self.first_allowed(run, stop):
+            return 0
+        taken = min(1.0, max(LEAST if before_end else LEAST_END, self.share_in_time(run.step)))
+        return min(run.step + math.floor((1 - taken) * window), stop - 1)
+
+    def mark(self, run: Run) -> None:
+        """Notes the clock before a window."""
+        skipped = sum(self.planned_until(step) - self.planned_until(step - 1) for step in self.skipped)
+        earlier = [mark for mark in self.marks if mark[0] < run.step]
+        self.marks = [*earlier[-RECENT:], (run.step, run.progress.seconds, self.planned_until(run.step) - skipped)]
+
+    def share_in_time(self, step: int) -> float:
+        """Returns the share of the steps before the last stretch, or left in it, for which there is time."""
+        rest = self.options.planned[-1] - self.planned_until(step)
+        left, needed = self.options.seconds - self.marks[-1][1], self.pace() * rest
+        if needed - left <= (0 if self.skipped else SLACK * self.options.seconds):
+            return 1.0
+        kept = self.pace() * (self.options.planned[-1] - self.planned_until(self.last_stretch))
+        kept = kept if step < self.last_stretch else 0.0
+        return (left - kept) / (needed - kept)
+
+    def pace(self) -> float:
+        """Returns the seconds of the last windows per planned second; without them, of the whole run."""
+        first = self.marks[0] if len(self.marks) > 1 else (0, 0.0, 0.0)
+        return (self.marks[-1][1] - first[1]) / (self.marks[-1][2] - first[2])
 
     def first_allowed(self, run: Run, before: int) -> int:
         """Returns the step after which others may be skipped: after all milestones before a step."""
         return max(1, round(self.options.start * self.context.iterations), last_milestone(run, before))
-
-    def late_before_end(self, run: Run) -> int:
-        """Returns the last step before the last stretch if what is left is only enough for that stretch."""
-        used, options = run.progress.seconds, self.options
-        pace = used / self.planned_until(run.step)
-        needed = pace * (options.planned[-1] - self.planned_until(self.last_stretch))
-        return self.last_stretch - 1 if used + needed >= options.seconds else 0
-
-    def late_at_end(self, run: Run) -> int:
-        """Returns the last step to skip so that the rest of the last stretch ends in time."""
-        step, used = run.step, run.progress.seconds
-        self.since = self.since or (step, used)
-        if step < self.since[0] + MEASURED:
-            return 0
-        pace = (used - self.since[1]) / (self.planned_until(step) - self.planned_until(self.since[0]))
-        needed = pace * (self.options.planned[-1] - self.planned_until(step))
-        late = used + needed - self.options.seconds
-        if late <= SLACK * self.options.seconds:
-            return 0
-        left = self.context.iterations - step
-        return step + min(math.floor(left * late / needed), self.room_at_end())
-
-    def room_at_end(self) -> int:
-        """Returns how many more steps of the last stretch may be skipped."""
-        length = self.context.iterations - self.last_stretch
-        return math.floor((1 - LEAST_END) * length) - sum(step >= self.last_stretch for step in self.skipped)
 
     def planned_until(self, step: int) -> float:
         """Returns the planned seconds of the first steps."""

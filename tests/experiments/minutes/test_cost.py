@@ -64,6 +64,8 @@ def test_cost_of_a_step_by_a_measurement() -> None:
     assert cost.seconds(0, 0) == pytest.approx(0.042)
     assert cost.seconds(1e6, 10_000) == pytest.approx(0.05 + 0.2)
     assert step_cost(measurement, options, "anchors").row == pytest.approx(3 * 0.8e-6)
+    many = step_cost(replace(measurement, primitives=100_000), options, "free")  # 0.08 s by the model, 0.05 s measured
+    assert (many.seconds(0, 0), many.seconds(0, 100_000)) == pytest.approx((0, 0.05))
     scattered = step_cost(replace(measurement, random=True), options, "free")
     assert scattered.seconds(0, 0) == pytest.approx(0.042 / 4)
     assert scattered.seconds(1e6, 10_000) == pytest.approx(0.25 / 4)

@@ -170,5 +170,7 @@ def test_other_runs_begin_without_stereo(task: Task) -> None:
 
 
 def test_a_scene_with_enough_points_gets_no_others() -> None:
-    task = with_points(primitives=10**6)
+    """And no time is kept for them."""
+    task, other = (with_points("scene.downscale", primitives=10**6, stereo=stereo) for stereo in (0.1, 0.2))
     assert changes_of(task, plan_run(task))["scene.stereo"] == 0
+    assert plan_run(task).other == plan_run(other).other

@@ -112,7 +112,8 @@ def step_cost(measurement: Measurement, options: CostOptions, backbone: str) -> 
     lasting = options.random if measurement.random else 1.0
     unit, base = lasting * measurement.megapixel / MILLION, lasting * measurement.base
     row = unit * options.primitives * options.rows.get(backbone, 1.0)
-    base = max(0.0, base - row * measurement.primitives)
+    row = min(row, base / max(1, measurement.primitives))  # rows at the start cost no more than what was measured
+    base -= row * measurement.primitives
     pixel = unit * options.late
     return StepCost(base=base, pixel=pixel, row=row, event=options.event)
 

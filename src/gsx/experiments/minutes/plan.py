@@ -152,7 +152,7 @@ def other_seconds(task: Task, downscale: int) -> float:
     checks = task.values[CHECKS] * min(task.tests, CHECKED) * measurement.check
     zooms = drawn_pixels(task, downscale) / drawn_pixels(task, measurement.downscale)
     drawn = larger * (task.tests * zooms * measurement.evaluate + checks)
-    stereo = measurement.stereo if with_stereo(task) else 0.0
+    stereo = measurement.stereo if stereo_points(task, target_of(task, downscale)) else 0.0
     return task.views * (measurement.photo + stereo) + drawn + task.options.report
 
 
@@ -194,7 +194,7 @@ def cost_of(task: Task) -> StepCost:
 def growth_of(task: Task, downscale: int, steps: int) -> Growth:
     """Returns the rows of the model over the run."""
     first, options, values = task.measurement.primitives, task.options, task.values
-    target = options.density * pixels_at(task, downscale) * math.sqrt(task.views) / rows_of(task)
+    target = target_of(task, downscale)
     first += stereo_points(task, target)
     last = min(target, first + options.most_growth * steps / 1000)
     if values.get(CAPACITY) == "budget" and CAPACITY in task.fixed:
@@ -203,6 +203,11 @@ def growth_of(task: Task, downscale: int, steps: int) -> Growth:
     start, stop = growth_window(task)
     events = events_of(task, steps)
     return Growth(first=first, last=max(1, round(last)), start=start, stop=stop, power=0.5, events=events)
+
+
+def target_of(task: Task, downscale: int) -> float:
+    """Returns the rows that suit the pixels of all views."""
+    return task.options.density * pixels_at(task, downscale) * math.sqrt(task.views) / rows_of(task)
 
 
 def stereo_points(task: Task, last: float) -> int:
