@@ -229,7 +229,8 @@ def test_both_competitors_and_neighbouring_views_are_in_the_report(tmp_path: Pat
 
 def test_perceptual_figures_stand_in_cards_zooms_and_views(tmp_path: Path) -> None:
     """The zoomed render is closer than its competitor at x2, further at x4; an entry of another shape is left out."""
-    result = evaluation(perceptual={"st_lpips_alex": 0.125, "niqe": None})
+    depth = {"absolute": 0.2, "relative": 0.0723, "within": 0.61}
+    result = evaluation(perceptual={"st_lpips_alex": 0.125, "niqe": None}, depth=depth)
     result["views"][1]["perceptual"] = {"st_lpips_alex": 0.4567}
     pairs = {"2": {"render": 0.2, "enlarged": 0.3}, "4": {"render": 0.5, "enlarged": 0.4}, "8": [1]}
     for factor, pair in pairs.items():
@@ -237,6 +238,7 @@ def test_perceptual_figures_stand_in_cards_zooms_and_views(tmp_path: Path) -> No
     page = Page(write_report(make_run(tmp_path / "run", result=result)))
     assert "st_lpips_alex 0.1250 lower is better" in page.text("figures")
     assert "niqe n/a not measured" in page.text("figures")
+    assert "Depth error 7.2 % 61 % of the pixels within 5 %" in page.text("figures")
     assert "×2 23.50 23.00 +0.50 +0.1000 0.2000 0.3000 win" in page.text("zoom")
     assert "×4 20.00 21.50 −1.50 +0.1000 0.5000 0.4000 loss" in page.text("zoom")
     assert 'class="n good" data-name="st_lpips_alex">0.2000' in page.source

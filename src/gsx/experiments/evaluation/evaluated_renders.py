@@ -16,6 +16,7 @@ from gsx.core.training.backbone import behind_scene
 from gsx.core.training.render import coverage_and_depth, render, splats_for
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.surface_errors import ExactDepth, mean_depth, surface_errors
 from gsx.experiments.evaluation.warp import Surface, surface_of
 from gsx.experiments.evaluation.zoomed import Zoomed
 from gsx.modules.alignment import estimate_camera
@@ -58,6 +59,13 @@ class EvaluatedRenders:
         depth, alpha = depth_and_coverage(self.run, camera, self.options.tile_pixels)
         counted = zoomed.view.counted() if zoomed.counted is None else zoomed.counted
         return surface_of(camera, depth, alpha, counted)
+
+    def surface_errors(self, view: View, evaluated: Bool[Tensor, "H W"] | None) -> dict[str, dict[str, float]]:
+        """Returns the errors of the model's depth on the evaluated pixels; empty: the true depth is unknown."""
+        if not isinstance(view.source, ExactDepth):
+            return {}
+        summed, alpha = depth_and_coverage(self.run, self.camera(view), self.options.tile_pixels)
+        return surface_errors(mean_depth(summed, alpha), view.source.exact_depth(view.camera), evaluated)
 
     def fit(self, view: View, image: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
         """Returns a render of a view in the colours that are compared; call it at the photos' resolution first."""

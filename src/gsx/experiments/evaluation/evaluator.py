@@ -31,6 +31,7 @@ from gsx.experiments.evaluation.lpips import load_lpips
 from gsx.experiments.evaluation.perceptual import MetricSettings, at_training_size, load_metrics
 from gsx.experiments.evaluation.protocol import protocol_of
 from gsx.experiments.evaluation.remarks import NOT_MEASURED, gathered, module_remarks, module_summaries
+from gsx.experiments.evaluation.surface_errors import surface_summary
 from gsx.experiments.evaluation.zoom_figures import ZoomFigures, measure_zoom, zoom_result
 from gsx.experiments.evaluation.zoomed import Drawing, Zoomed
 
@@ -107,6 +108,7 @@ class Evaluator:
             "ssim": self.ssim(image, truth, evaluated),
             "lpips": None if self.lpips is None else self.lpips.distance(*parts),
             "perceptual": self.perceptual.view(*parts),
+            "surface": self.renders.surface_errors(view, evaluated),
             "visible": int(tiled.visible.sum()),
             "left_out": tiled.dropped,
         }
@@ -222,6 +224,7 @@ class Evaluator:
             "primitives": primitives,
             "visible_primitives": mean([v["visible"] for v in views]),
             "left_out": mean([v["left_out"] for v in views]),
+            **surface_summary(views),
             **gathered(curves),
             **module_summaries(run),
             "megabytes": size / 1e6,
@@ -234,7 +237,7 @@ class Evaluator:
             "groups": {name: group_figures(vs) | self.perceptual.summary(vs) for name, vs in by_group.items()},
             **({"competitor": self.competitor.provenance()} if self.competitor else {}),
             "zoom": self.zooms(views, drawing, advance),
-            "views": [{key: v[key] for key in ("name", "group", *figures, "perceptual")} for v in views],
+            "views": [{key: v[key] for key in ("name", "group", *figures, "perceptual")} | v["surface"] for v in views],
         }
         return evaluation | module_remarks(run, evaluation)
 

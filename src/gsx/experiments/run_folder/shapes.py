@@ -64,6 +64,7 @@ EVALUATION: Shape = {
     "left_out?": is_number_or_null,
     "perceptual?": {str: is_number_or_null},
     "remarks?": [str],
+    "depth?": {"absolute": is_number, "relative": is_number, "within": is_number},
     "coverage?": {
         "unavailable?": str,
         "least_views?": is_number,

@@ -125,6 +125,7 @@ def summary(evaluation: dict[str, Any]) -> list[str]:
     lpips = "n/a (no weights)" if e["lpips"] is None else f"{e['lpips']:.4f}"
     quality = f"held-out PSNR {e['psnr']:.2f} dB, SSIM ({e['protocol']['ssim']}) {e['ssim']:.4f}, LPIPS {lpips}"
     quality += "".join(f", {name} {perceptual_figure(e, name):.4f}" for name in perceptual_names(e))
+    quality += f", depth error {e['depth']['relative']:.1%}" if "depth" in e else ""
     lines = [line for factor, result in e["zoom"].items() for line in zoom_lines(factor, result, upscaler_of(e))]
     return [quality, cost, *coverage_lines(e), *lines, *remarks_of(e)]
 

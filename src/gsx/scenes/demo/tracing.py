@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.shapes import Float, Int, UInt8
-from gsx.scenes.demo.solids import SPHERE, column, normalise, shape_interval, sum_of, window
+from gsx.scenes.demo.solids import SPHERE, column, dot, normalise, shape_interval, sum_of, window
 from gsx.scenes.demo.still_life import DOME, StillLife, ground_colour, sky_colour, thing_colour
 
 BAND_RAYS = 1 << 17  # rays evaluated at once: about 50 MB of working memory
@@ -142,6 +142,14 @@ def colours_of(life: StillLife, hits: HitPoints) -> Float[Tensor, "3 points"]:
 def shade(life: StillLife, rays: Rays, hits: Hits) -> Float[Tensor, "3 *rays"]:
     """Return display colours of hits, in [0, 1], on the raster of the rays."""
     return colours_of(life, hit_points(rays, hits)).reshape(rays.directions.shape)
+
+
+def depth_of(life: StillLife, camera: Camera) -> Float[Tensor, "H W"]:
+    """Return camera z of the surface at each pixel's centre, scene units; infinite where only the sky is."""
+    rays = camera_rays(camera, 1)
+    hits = trace(life, rays, camera)
+    ahead = dot(column(camera.rotation[2], rays.directions), rays.directions)
+    return torch.where(hits.owner == SKY, torch.inf, ahead * hits.depth)[0]
 
 
 def render(life: StillLife, camera: Camera, samples: int) -> UInt8[Tensor, "3 H W"]:

@@ -22,7 +22,7 @@ from gsx.engine.cached_images import cache_image, read_cached_image
 from gsx.scenes.demo.cameras import DISTANCES, Cameras, even_cameras, mixed_cameras, spiral_camera
 from gsx.scenes.demo.passer_by import with_passer_by
 from gsx.scenes.demo.still_life import StillLife, make_still_life
-from gsx.scenes.demo.tracing import colours_of, points_at, render
+from gsx.scenes.demo.tracing import colours_of, depth_of, points_at, render
 from gsx.scenes.options import SceneOptions, refuse_other
 from gsx.scenes.splits import parse_rule
 
@@ -83,6 +83,10 @@ class DemoSource:
         """Return the picture of a camera; a crop has the same bytes as the whole picture there."""
         key = camera_key(camera)
         return self.cache.get((self.folder, key), lambda: self.picture(camera, self.folder / f"{key}.png"))
+
+    def exact_depth(self, camera: Camera) -> Float[Tensor, "H W"]:
+        """Return camera z of the surface at each pixel's centre, scene units; infinite in the sky."""
+        return depth_of(self.life, camera)
 
     def picture(self, camera: Camera, path: Path) -> UInt8[Tensor, "3 H W"]:
         """Render a picture, or read it where an earlier run has rendered it."""
