@@ -50,8 +50,6 @@ BASE = "gs3d"
 """Method that others are compared with."""
 SCENE = {"demo": ("scene.downscale=2",), "lego": ("scene.random_points=10000",)}
 """What a plan of two minutes on one core chooses for a scene, for all methods."""
-LIMITS = {"desk_bottle": 300}
-"""Seconds to plan for where a plan for the minutes ends after half of them: its cost model is for larger views."""
 ATTEMPTS, TOLERANCE = 3, 0.15
 """Runs at the most until one keeps the minutes, and the share of time to miss and of steps to skip."""
 REFUSED, FEW = "give more minutes", 200
@@ -157,8 +155,7 @@ def planned(bench: Bench, method: str, scene: str) -> Row:
     """Trains by a plan for the minutes; where it is refused, some steps by the plan of the method before."""
     folder = bench.folder(method, scene, 1)
     try:
-        limit = f"seconds={LIMITS.get(scene, bench.goal):g}"
-        return attempted(bench, folder, [*bench.scene_words(scene), *METHODS[method], limit])
+        return attempted(bench, folder, [*bench.scene_words(scene), *METHODS[method], f"seconds={bench.goal:g}"])
     except subprocess.CalledProcessError:
         if REFUSED not in log_of(folder).read_text():
             raise
