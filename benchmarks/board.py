@@ -3,8 +3,8 @@
     python benchmarks/board.py --scenes FOLDER [--opensplat PROGRAM] [--only fox,lego] [--methods gs3d,zoom_prior]
 
 Scenes are those of benchmarks/zoom.py. Methods of gsx are planned for the minutes as by `gsx minutes=M`. Where a run
-misses its time by more than 15 %, or skips more than 15 % of its steps to keep it, the same plan is trained
-without a clock, in as many steps as last the minutes. OpenSplat takes as many steps as last the minutes by runs that
+misses its time by more than 15 %, the same plan is trained without a clock, in as many steps as last the minutes. Steps
+are those that a run takes: one that falls behind skips some. OpenSplat takes as many steps as last the minutes by runs that
 were timed before, with its schedules compressed to them. Wall times are those of whole processes, from command to
 report, with photos, poses and compiled code in the cache; zoomed pictures are rendered and judged outside of them.
 Finished runs below --runs are not repeated, and judgements only if there are other runs. Nothing else should run on the
@@ -51,7 +51,7 @@ BASE = "gs3d"
 SCENE = {"demo": ("scene.downscale=2",), "lego": ("scene.random_points=10000",)}
 """What a plan of two minutes on one core chooses for a scene, for all methods."""
 ATTEMPTS, TOLERANCE = 3, 0.15
-"""Runs at the most until one keeps the minutes, and the share of time to miss and of steps to skip."""
+"""Runs at the most until one keeps the minutes, and the share of them to miss."""
 REFUSED, FEW = "give more minutes", 200
 """In the log of a plan that finds the minutes too short, and the steps of the run instead."""
 ENVIRONMENT, COMPARISON = "environment.json", "comparison.json"
@@ -144,11 +144,11 @@ def trained(bench: Bench, method: str, scene: str) -> Row:
     row, kept = planned(bench, method, scene), list[Row]()
     for attempt in range(2, ATTEMPTS + 2):
         kept += [] if row["compiled"] else [row]
-        if attempt > ATTEMPTS or (kept and within(bench, kept[-1])):
+        if attempt > ATTEMPTS or (kept and missed(bench, kept[-1]) <= TOLERANCE):
             break
         words = repeated(row, bench.goal) if kept else row["words"]
         row = attempted(bench, bench.folder(method, scene, attempt), words)
-    return min(kept, key=lambda row: (row["skipped"] > TOLERANCE, missed(bench, row)))
+    return min(kept, key=lambda row: missed(bench, row))
 
 
 def planned(bench: Bench, method: str, scene: str) -> Row:
@@ -162,11 +162,6 @@ def planned(bench: Bench, method: str, scene: str) -> Row:
     before = planned(bench, list(METHODS)[list(METHODS).index(method) - 1], scene)
     words = [word for word in before["repeat"] if not word.startswith(("iterations=", "backbone=", "preset="))]
     return attempted(bench, folder, [*words, *METHODS[method], f"iterations={FEW}"])
-
-
-def within(bench: Bench, row: Row) -> bool:
-    """Returns whether a run kept the minutes and its steps."""
-    return row["skipped"] <= TOLERANCE and missed(bench, row) <= TOLERANCE
 
 
 def missed(bench: Bench, row: Row) -> float:
@@ -186,7 +181,6 @@ def attempted(bench: Bench, folder: Path, words: Sequence[str]) -> Row:
         "primitives": evaluation["primitives"],
         "peak_mb": evaluation["peak_memory_mb"],
         "program": f"gsx {environment['gsx']}, source {environment['source'][:8]}",
-        "skipped": left_out / evaluation["step"],
         "train_seconds": evaluation["train_seconds"],
         "before": environment.get("minutes", {}).get("before_s", 0.0),
         "repeat": environment.get("minutes", {}).get("repeat", words),

@@ -13,6 +13,7 @@ SETTINGS = (
     *("rasterizer", "regenerator"),
 )
 """Settings of scene and figures; other words NAME=PATH are methods."""
+FOLDER = "conf/protocol"
 SCENE = ("scene=", "dataset=")
 """Settings that choose a scene."""
 
@@ -48,8 +49,11 @@ def parse_methods(arguments: list[str]) -> argparse.Namespace:
 
 
 def names(word: str) -> list[str]:
-    """Split names at commas; a name that is repeated counts once."""
-    return list(dict.fromkeys(name for name in word.split(",") if name))
+    """Split names at commas; a name that is repeated counts once. ConfigError: there is none."""
+    found = list(dict.fromkeys(name.strip() for name in word.split(",") if name.strip()))
+    if not found:
+        raise ConfigError(f"gsx judge: --protocols '{word}' names no protocol: leave it out, or name those of {FOLDER}")
+    return found
 
 
 def sorted_words(words: list[str]) -> tuple[list[tuple[str, Path]], list[Path], list[str]]:
@@ -93,6 +97,8 @@ def existing_path(name: str, word: str) -> Path:
     path = expand_home(word)
     if not name or not word:
         raise ConfigError(f"gsx judge: '{name}={word}' names no method and path: write NAME=PATH")
+    if "{" in word and "{scene}" not in word and not path.exists():
+        raise InputError(f"gsx judge: '{name}={word}' does not exist, and in braces only {{scene}} has a meaning")
     if "{scene}" not in word and not path.exists():
         raise InputError(
             f"gsx judge: '{name}={word}': there is no such file or folder, and gsx judge has no setting '{name}'"

@@ -310,8 +310,10 @@ def test_partial_judges_the_views_that_all_methods_have(subject: Subject, pictur
     folder = Path(shutil.copytree(pictures, tmp_path / "pictures"))
     sorted((folder / "x1").iterdir())[0].unlink()
     words = [f"a={folder}", f"b={pictures}", *subject.words, "--partial"]
-    for method in judged(tmp_path / "out", *words)["results"][0]["methods"]:
-        assert len(method["views"]) == 2
+    first, second = judged(tmp_path / "out", *words)["results"][0]["methods"]
+    assert len(first["views"]) == len(second["views"]) == 2
+    assert any("has no pictures of 1 test view," in note for note in first["notes"])
+    assert not any("has no pictures" in note for note in second["notes"])
 
 
 def test_a_file_in_other_coordinates_is_doubted(subject: Subject, tmp_path: Path) -> None:

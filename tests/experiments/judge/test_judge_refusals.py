@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from judging import Subject, judged, made_subject, write_method
 
 from gsx.cli.dispatch import main
-from gsx.core.data.images import read_image
+from gsx.core.data.images import read_image, write_image
+from gsx.experiments.judge.picture_files import read_header
 
 
 @pytest.fixture(scope="module")
@@ -173,3 +175,27 @@ def test_depth_needs_a_model(subject: Subject, pictures: Path, tmp_path: Path, c
 def test_a_protocol_that_is_repeated_counts_once(subject: Subject, pictures: Path, tmp_path: Path) -> None:
     found = judged(tmp_path / "out", f"a={pictures}", *subject.words, "--protocols", "inria,inria")
     assert [result["protocol_name"] for result in found["results"]] == ["inria"]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--protocols", ","], "--protocols ',' names no protocol"),
+        (["b=renders/{scne}"], "in braces only {scene} has a meaning"),
+    ],
+)
+def test_slips_of_the_command_line(
+    words: list[str], sentence: str, subject: Subject, pictures: Path, tmp_path: Path, capsys
+) -> None:
+    assert sentence in refusal(tmp_path, capsys, f"a={pictures}", *subject.words, *words)
+
+
+def test_photos_in_place_of_renders_are_noticed(subject: Subject, tmp_path: Path) -> None:
+    photos = write_method(subject, tmp_path / "photos", strength=0)
+    found = judged(tmp_path / "out", f"a={photos}", *subject.words)
+    assert "these are the photos themselves: all pixels are equal" in found["results"][0]["methods"][0]["notes"]
+
+
+def test_a_turned_picture_is_remarked(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.jpg", torch.zeros(3, 4, 6), {"Orientation": 6})
+    assert "turned by EXIF, which is not applied" in read_header(tmp_path / "a.jpg").remarks

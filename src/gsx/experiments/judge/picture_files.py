@@ -32,7 +32,8 @@ def read_header(path: Path) -> Header:
     if path.suffix.lower() == ".npy":
         return array_header(path)
     spec = header_of(path)
-    remarks = tuple(remarks_on(path, spec.nchannels, str(spec.format)))
+    turned = ["turned by EXIF, which is not applied"] if spec.get_int_attribute("Orientation", 1) != 1 else []
+    remarks = (*remarks_on(path, spec.nchannels, str(spec.format)), *turned)
     return Header(size=(spec.width, spec.height), remarks=remarks)
 
 

@@ -1,6 +1,7 @@
 """Methods on one scene, measured by one protocol."""
 
 import logging
+import math
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.lpips import load_lpips
 from gsx.experiments.evaluation.perceptual import MetricSettings, load_metrics
 from gsx.experiments.evaluation.protocol import protocol_of
+from gsx.experiments.judge.counts import counted
 from gsx.experiments.judge.crops import Crops
 from gsx.experiments.judge.matching import Matcher
 from gsx.experiments.judge.measure import Measured, Measurement, Protocol, own_truth_psnr
@@ -212,19 +214,21 @@ def refuse_unmeasurable(methods: Sequence[Method], zooms: Sequence[float], scene
 def with_shared_views(scene: Scene, methods: Sequence[Method], zooms: Sequence[float]) -> Scene:
     """Returns the scene with the test views that all methods have, at each zoom that they have; InputError: none."""
 
-    def shared(view: View) -> bool:
-        return all(
-            method.camera(view, factor) is not None
-            for method in methods
-            for factor in set(method.factors() or zooms) & set(zooms)
-        )
-
-    views = [view for view in scene.test if shared(view)]
+    lacking = {method: [view for view in scene.test if lacks(method, view, zooms)] for method in methods}
+    for method, views in lacking.items():
+        if views:
+            method.notes.append(f"has no pictures of {counted(len(views), 'test view')}, such as '{views[0].name}'")
+    views = [view for view in scene.test if not any(view in one for one in lacking.values())]
     if not views:
         raise InputError("no test view has pictures of all methods: compare them one by one")
     if len(views) < len(scene.test):
         logger.warning("%d of %d test views have pictures of all methods and are measured", len(views), len(scene.test))
     return replace(scene, test=views)
+
+
+def lacks(method: Method, view: View, zooms: Sequence[float]) -> bool:
+    """Returns whether a method lacks a picture of a view at a zoom at which it has others."""
+    return any(method.camera(view, factor) is None for factor in set(method.factors() or zooms) & set(zooms))
 
 
 def log_notes(method: Method, zooms: Sequence[float], scene: Scene) -> None:
@@ -291,7 +295,13 @@ def result_of(measured: Measured, scene: Scene) -> dict[str, Any]:
         "repetition": entry.repetition,
         "path": str(entry.path),
         **measured.method.facts(),
-        "notes": measured.method.notes,
+        "notes": [*measured.method.notes, *note_on_photos(measured)],
         "zoom": measured.means(),
         "views": measured.views,
     }
+
+
+def note_on_photos(measured: Measured) -> list[str]:
+    """Returns a note if the pictures of a method are the photos themselves."""
+    levels = [figures["psnr"] for figures in measured.means().values()]
+    return ["these are the photos themselves: all pixels are equal"] if levels and min(levels) == math.inf else []
