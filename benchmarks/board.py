@@ -4,8 +4,8 @@
 
 Scenes are those of benchmarks/zoom.py. Methods of gsx are planned for the minutes as by `gsx minutes=M`. Where a run
 misses its time by more than 15 %, the same plan is trained without a clock, in as many steps as last the minutes. Steps
-are those that a run takes: one that falls behind skips some. OpenSplat takes as many steps as last the minutes by runs that
-were timed before, with its schedules compressed to them. Wall times are those of whole processes, from command to
+are those that a run takes: one that falls behind skips some. OpenSplat takes as many steps as last the minutes by runs
+that were timed before, with its schedules compressed to them. Wall times are those of whole processes, from command to
 report, with photos, poses and compiled code in the cache; zoomed pictures are rendered and judged outside of them.
 Finished runs below --runs are not repeated, and judgements only if there are other runs. Nothing else should run on the
 processor that the runs are pinned to. Two hours on one core for five scenes. OpenSplat 1.1.5 needs the repair that
