@@ -96,9 +96,11 @@ def add_trackers(registry: Registry) -> None:
     """Register listeners that report a run to other programs."""
     from gsx.trackers.mlflow import MLflow, MLflowOptions
     from gsx.trackers.tensorboard import TensorBoard, TensorBoardOptions
+    from gsx.trackers.wandb import WandB, WandBOptions
 
     registry.add("tracker", "tensorboard", TensorBoard, TensorBoardOptions)
     registry.add("tracker", "mlflow", MLflow, MLflowOptions)
+    registry.add("tracker", "wandb", WandB, WandBOptions)
 
 
 def add_compositors(registry: Registry) -> None:

@@ -102,9 +102,13 @@ def test_the_run_is_named_and_has_its_parameters_and_files(finished: Path, outpu
     assert found.data.params == {key: str(value) for key, value in flattened(told).items()}
     assert found.data.params["iterations"] == "12"
     assert found.data.tags["gsx.folder"] == str(finished)
-    assert {file.path for file in client.list_artifacts(run_id)} == {"config.yaml", "evaluation.json", "report.html"}
+    files = {"config.yaml", "evaluation.json", "report.html", "zoom.csv", "pictures"}
+    assert {file.path for file in client.list_artifacts(run_id)} == files
     copies = output / "mlflow_files" / "demo" / run_id / "artifacts"
     assert (copies / "report.html").read_bytes() == (finished / "report.html").read_bytes()
+    assert (copies / "zoom.csv").read_text().splitlines()[1].startswith("x1,")
+    crop = json.loads((finished / "renders" / "index.json").read_text())["zoom"][0]["files"]["render"]
+    assert (copies / "pictures" / crop).read_bytes() == (finished / "renders" / crop).read_bytes()
 
 
 def test_an_interrupted_run_is_killed_and_goes_on_as_the_same_run(output: Path) -> None:

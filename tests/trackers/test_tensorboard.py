@@ -72,12 +72,15 @@ def test_the_evaluation_is_that_of_the_file(finished: Path) -> None:
 def test_pictures_and_the_configuration_are_there(finished: Path) -> None:
     events = read(finished / "tensorboard")
     names = [view["name"] for view in json.loads((finished / "evaluation.json").read_text())["views"]]
-    expected = sorted(f"{name}/{kind}" for name in names for kind in ("render", "truth"))
+    crops = ("x2/enlarged", "x2/render", "x2/truth", "x2/upscaled")
+    expected = sorted(f"{name}/{kind}" for name in names for kind in ("render", "truth", *crops))
     assert sorted(events.Tags()["images"]) == expected
     (picture,) = events.Images(expected[0])
     assert (picture.step, picture.width, picture.height) == (12, 48, 36)
     (text,) = events.Tensors("config/text_summary")
     assert "    iterations: 12\n" in text.tensor_proto.string_val[0].decode()
+    (text,) = events.Tensors("zoom/text_summary")
+    assert "\n| x2 | " in text.tensor_proto.string_val[0].decode()
 
 
 @pytest.mark.parametrize("count", [0, 1])

@@ -14,14 +14,14 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 from filelock import FileLock
 
 from gsx.core.errors import ConfigError, first_line
-from gsx.core.files import read_json, write_json
+from gsx.core.files import csv_text, read_json, write_json
 from gsx.core.options import flattened
 from gsx.core.packages import require
 from gsx.core.plugins import hookimpl
 from gsx.core.ranges import Seconds
 from gsx.core.training.run import Run
 from gsx.engine.machine import device_name
-from gsx.trackers.figures import evaluation_figures, line_figures
+from gsx.trackers.figures import PictureCount, evaluation_figures, line_figures, pictures, zoom_table
 
 logger = logging.getLogger(__name__)
 
@@ -57,6 +57,8 @@ class MLflowOptions:
     """Name of the experiment; empty: the scene's name."""
     seconds: Seconds
     """Least time between requests during training, s."""
+    pictures: PictureCount = 0
+    """The default is for runs older than this option."""
 
     def __post_init__(self) -> None:
         if holds_secret(self.uri):  # it would be in config.yaml, report and logs
@@ -137,9 +139,13 @@ class MLflow:
             self.client.set_terminated(self.run_id, "KILLED")
 
     @hookimpl
-    def gsx_evaluated(self, evaluation: dict[str, Any]) -> None:
-        """Sends the metrics."""
+    def gsx_evaluated(self, run: Run, evaluation: dict[str, Any]) -> None:
+        """Sends metrics, zoom table and pictures."""
         self.log(metrics(evaluation_figures(evaluation), evaluation["step"]))
+        if table := zoom_table(evaluation):
+            self.client.log_text(self.run_id, csv_text([*table[0]], table), "zoom.csv")
+        for path in pictures(run.folder / "renders", self.options.pictures).values():
+            self.client.log_artifact(self.run_id, str(path), "pictures")
 
     @hookimpl
     def gsx_run_finished(self, run: Run) -> None:

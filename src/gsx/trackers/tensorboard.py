@@ -1,16 +1,15 @@
-"""TensorBoard: curves of metrics.jsonl, evaluation, test pictures and configuration."""
+"""TensorBoard: curves of metrics.jsonl, evaluation, zoom table, test pictures and configuration."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from gsx.core.data.images import read_image
-from gsx.core.files import expand_home, read_json
+from gsx.core.files import expand_home
 from gsx.core.packages import require
 from gsx.core.plugins import hookimpl
-from gsx.core.ranges import Range
 from gsx.core.training.run import Run
-from gsx.trackers.figures import evaluation_figures, line_figures
+from gsx.trackers.figures import PictureCount, evaluation_figures, line_figures, markdown, pictures, zoom_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,8 +19,7 @@ class TensorBoardOptions:
     name: str
     folder: str
     """Folder with a subfolder per run; empty: `tensorboard` in the run folder."""
-    pictures: Annotated[int, Range(0, 10**6)]
-    """Number of test views written at an evaluation, with render and truth."""
+    pictures: PictureCount
 
 
 class TensorBoard:
@@ -62,9 +60,10 @@ class TensorBoard:
 
     @hookimpl
     def gsx_evaluated(self, run: Run, evaluation: dict[str, Any]) -> None:
-        """Writes metrics and pictures."""
+        """Writes metrics, zoom table and pictures."""
         for tag, value in evaluation_figures(evaluation).items():
             self.writer.add_scalar(tag, value, evaluation["step"])
+        self.writer.add_text("zoom", markdown(zoom_table(evaluation)), evaluation["step"])
         for tag, path in pictures(run.folder / "renders", self.options.pictures).items():
             self.writer.add_image(tag, read_image(path), evaluation["step"])
 
@@ -96,16 +95,6 @@ def events_folder(run: Run, folder: str) -> Path:
         return run.folder / "tensorboard"
     place, output = run.folder.resolve(), Path(run.config["output"]).resolve()
     return expand_home(folder) / (place.relative_to(output) if place.is_relative_to(output) else place.name)
-
-
-def pictures(renders: Path, count: int) -> dict[str, Path]:
-    """Returns the pictures of the first `count` test views, by tag."""
-    views = read_json(renders / "index.json")["views"][:count]
-    return {
-        f"{view['name']}/{kind}": renders / Path(view["files"][kind]).name
-        for view in views
-        for kind in ("render", "truth")
-    }
 
 
 def indented(text: str) -> str:

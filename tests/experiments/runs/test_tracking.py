@@ -2,10 +2,12 @@
 
 import os
 import re
+import socket
 import subprocess
 import sys
 import textwrap
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +30,11 @@ from gsx.experiments.runs.open import open_run, start
 from gsx.experiments.runs.saved_settings import read_config, write_config
 from gsx.experiments.runs.tracking import Tracking
 from gsx.experiments.runs.warm_start import warm_start_folder
-from gsx.trackers.figures import evaluation_figures, line_figures
+from gsx.trackers.figures import evaluation_figures, html, line_figures, markdown, zoom_table
 
 ROOT = Path(__file__).parents[3]
-BOTH = ("tracker=[tensorboard,mlflow]", "tracker.mlflow.seconds=0")
+NAMES = ",".join(name for name in ("tensorboard", "mlflow", "wandb") if find_spec(name))
+ALL = (f"tracker=[{NAMES}]", "tracker.mlflow.seconds=0")
 FEW = ("scene.points=100", "scene.train_views=3")
 DENSE = (*FEW, "iterations=12", "backbone.density.every=400", "backbone.density.reset_passes=1",
          "backbone.density.gradient=1e-6", "training.checkpoint_every=5")  # fmt: skip
@@ -192,16 +195,21 @@ def test_a_misspelt_hook_of_a_tracker_is_refused() -> None:
 OFFLINE = """
 import socket, sys, time
 asked = []
+connect = socket.socket.connect
 def refuse(*words, **more):
+    if words[0].family == socket.AF_UNIX:  # W&B's own process, which has a server of this test to ask
+        return connect(*words)
     asked.append(words)
     raise OSError("no network in this test")
-socket.socket.connect = socket.getaddrinfo = refuse
+socket.socket.connect = refuse
+socket.getaddrinfo = lambda *words, **more: refuse(socket.socket(), *words)
 from gsx.cli.dispatch import main
 from gsx.builtin import plugins
 plugins()
-assert not {"tensorboard", "mlflow"} & set(sys.modules), "imported before they were chosen"
-code = main(sys.argv[1:])
-assert {"tensorboard", "mlflow"} <= set(sys.modules)
+trackers = set(sys.argv[1].split(","))
+assert not trackers & set(sys.modules), "imported before they were chosen"
+code = main(sys.argv[2:])
+assert trackers <= set(sys.modules)
 from mlflow.telemetry.client import get_telemetry_client
 assert get_telemetry_client() is None, "telemetry is on"
 time.sleep(1)  # it would ask from another thread
@@ -213,14 +221,20 @@ Tracked = tuple[Path, subprocess.CompletedProcess[str]]
 
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory: pytest.TempPathFactory) -> Tracked:
-    """A run with both trackers, in a process of its own, as a user's: MLflow's telemetry is always off inside pytest
+    """A run with all trackers, in a process of its own, as a user's: MLflow's telemetry is always off inside pytest
     and CI."""
     folder = tmp_path_factory.mktemp("tracked")
-    hidden = ("PYTEST", "CI", "MLFLOW", "DO_NOT_TRACK", "GITHUB", "BUILD")
+    hidden = ("PYTEST", "CI", "MLFLOW", "WANDB", "DO_NOT_TRACK", "GITHUB", "BUILD")
     environment = {key: value for key, value in os.environ.items() if not key.startswith(hidden)}
     environment["GSX_CACHE"] = str(tmp_path_factory.mktemp("cache"))
-    command = [sys.executable, "-c", OFFLINE, *words(folder / "run", *DENSE, *BOTH, f"output={folder}")]
-    return folder, subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=folder)
+    command = [sys.executable, "-c", OFFLINE, NAMES, *words(folder / "run", *DENSE, *ALL, f"output={folder}")]
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        environment["WANDB_BASE_URL"] = f"http://127.0.0.1:{server.getsockname()[1]}"
+        result = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=folder)
+        server.settimeout(0.1)
+        with pytest.raises(TimeoutError):  # nobody asked it for anything
+            server.accept()
+    return folder, result
 
 
 def test_a_run_with_trackers_ends_in_the_same_bits(tmp_path: Path, tracked: Tracked) -> None:
@@ -232,6 +246,7 @@ def test_a_run_with_trackers_ends_in_the_same_bits(tmp_path: Path, tracked: Trac
     assert all(torch.equal(without[name], with_trackers[name]) for name in without)
     assert (folder / "mlflow.db").is_file()
     assert (folder / "run" / "tensorboard").is_dir()
+    assert (folder / "run" / "wandb").is_dir() == ("wandb" in NAMES)
 
 
 def test_runs_with_and_without_trackers_are_one_composition(tmp_path: Path) -> None:
@@ -239,8 +254,8 @@ def test_runs_with_and_without_trackers_are_one_composition(tmp_path: Path) -> N
     run = start(settings, plugins())
     folder = warm_start_folder(run, settings.idle, {})
     key, config = key_of(read_run(run.folder)), comparable(run.config)
-    write_config(run.folder / "config.yaml", tiny_settings(tmp_path / "other", "iterations=2", *BOTH).resolved)
-    run.config = compose(words(run.folder, "iterations=2", *BOTH), plugins()).resolved
+    write_config(run.folder / "config.yaml", tiny_settings(tmp_path / "other", "iterations=2", *ALL).resolved)
+    run.config = compose(words(run.folder, "iterations=2", *ALL), plugins()).resolved
     assert "mlflow" in run.config["tracker"]
     assert warm_start_folder(run, settings.idle, {}) == folder
     assert key_of(read_run(run.folder)) == key
@@ -275,7 +290,8 @@ def test_wrong_choices_are_refused(given: str, message: str, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("tracker", "package"), [("tensorboard", "tensorboard"), ("mlflow", "mlflow"), ("mlflow", "sqlalchemy")]
+    ("tracker", "package"),
+    [("tensorboard", "tensorboard"), ("mlflow", "mlflow"), ("mlflow", "sqlalchemy"), ("wandb", "wandb")],
 )
 def test_a_missing_package_is_refused_before_anything_is_done(
     tracker: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -301,7 +317,7 @@ def test_a_package_that_went_missing_is_refused_when_a_run_goes_on(
 
 def test_trackers_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plugins"]) == 0
-    assert re.search(r"tracker: +mlflow \(gsx\), tensorboard \(gsx\)", capsys.readouterr().out)
+    assert re.search(r"tracker: +mlflow \(gsx\), tensorboard \(gsx\), wandb \(gsx\)", capsys.readouterr().out)
 
 
 def test_numbers_are_named_as_in_the_files() -> None:
@@ -320,12 +336,27 @@ def test_numbers_are_named_as_in_the_files() -> None:
     evaluation = {"step": 7, "psnr": 21.0, "lpips": None, "zoom": zoom, "protocol": {"hash": "x"}, "views": []}
     assert evaluation_figures(evaluation) == {"evaluation/psnr": 21.0, "evaluation/x2/psnr": 20.0}
     zoom["2"]["perceptual"] = {"st_lpips_alex": {"render": 0.25, "enlarged": 0.5}}
+    zoom["2"]["detail"] = {"render": {"explained": 0.75, "energy": 1.0}}
     perceptual = {"perceptual": {"st_lpips_alex": 0.125, "niqe": None}}
     assert evaluation_figures(evaluation | perceptual) == evaluation_figures(evaluation) | {
         "evaluation/st_lpips_alex": 0.125,
+        "evaluation/x2/detail": 0.75,
         "evaluation/x2/st_lpips_alex": 0.25,
         "evaluation/x2/enlarged_st_lpips_alex": 0.5,
     }
+
+
+def test_the_zoom_table_has_a_row_for_each_zoom() -> None:
+    zoom = {"2": {"psnr": 20.0, "enlarged_psnr": 18.5, "views": 3}, "4": {"unavailable": "no truth"}}
+    table = zoom_table({"zoom": zoom})
+    assert table == [
+        {"zoom": "x2", "gain": "1.5", "psnr": "20", "enlarged_psnr": "18.5", "views": "3"},
+        {"zoom": "x4", "gain": "", "psnr": "", "enlarged_psnr": "", "views": ""},
+    ]
+    few = [{"zoom": "x2", "psnr": "20"}]
+    assert markdown(few) == "| zoom | psnr |\n| --- | --- |\n| x2 | 20 |\n"
+    assert "<tr><td>zoom</td><td>psnr</td></tr><tr><td>x2</td><td>20</td></tr>" in html(few)
+    assert (zoom_table({}), markdown([]), html([])) == ([], "", "")
 
 
 def test_nothing_is_asked_of_the_network_and_little_is_said(tracked: Tracked) -> None:
