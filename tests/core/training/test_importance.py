@@ -97,6 +97,16 @@ def test_weights_are_summed_where_pixels_do_not_count_and_everywhere() -> None:
     torch.testing.assert_close(all_over, shown)
 
 
+def test_rows_count_in_a_view_that_draws_none_of_their_splats() -> None:
+    """Models whose splats are decoded for each view, such as anchors of a coarse level, may draw nothing there."""
+    camera, nothing = view_of(12, 9).camera, torch.zeros(0, dtype=torch.long)
+    none = Splats(**{name: value[:0] for name, value in vars(cloud(1)).items()})
+    seen = render_with_leaves(none, plain(camera), RULES, BACKGROUND, nothing, 4)
+    assert seen.squared_changes(None, 2, torch.Generator()).tolist() == [0.0] * 4
+    assert not seen.visible_rows().any()
+    assert all(not part.any() for part in seen.blending_weights(None))
+
+
 def test_what_the_picture_loses_without_a_splat() -> None:
     """Two pixels, six values: the mean over all 64 signs is the difference between two renders, squared."""
     splats, view = cloud(4), view_of(2, 1)

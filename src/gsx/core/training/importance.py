@@ -9,6 +9,7 @@ Both are gradients of one render I, with colours c_k, blending weights w_k and a
 """
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -56,7 +57,7 @@ class ProbeRender:
         """Sums values over the splats of each row."""
         if self.rows is None:
             return values
-        each = values.reshape(-1, values.shape[-1]).T
+        each = values.reshape(math.prod(values.shape[:-1]), values.shape[-1]).T
         return sum_by_splat(each, self.rows, self.count).T.reshape(*values.shape[:-1], self.count)
 
     def visible_rows(self) -> Bool[Tensor, "N"]:
