@@ -19,7 +19,7 @@ def add_scenes(registry: Registry) -> None:
     from gsx.scenes import blender, bungee, colmap, demo, photos, room, transforms
 
     registry.add("scene", "demo", demo.load, demo.DemoOptions)
-    registry.add("scene", "room", room.load, demo.RayCastOptions)
+    registry.add("scene", "room", room.load, room.RoomOptions)
     registry.add("scene", "photos", photos.load, photos.PhotosOptions, photos.FORMAT)
     registry.add("scene", "transforms", transforms.load, transforms.TransformsOptions, transforms.FORMAT)
     registry.add("scene", "colmap", colmap.load, colmap.ColmapOptions, colmap.FORMAT)

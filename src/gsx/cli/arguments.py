@@ -294,6 +294,18 @@ def parse_compact(arguments: list[str]) -> argparse.Namespace:
     return options
 
 
+def parse_merge(arguments: list[str]) -> argparse.Namespace:
+    """Parse `gsx merge DIR [DIR ...] --to FILE`."""
+    description = (
+        "Join runs that were trained on the blocks of a scene (scene.block=1/3 and so on) to one splat file, and "
+        "measure it on the test views of the whole scene."
+    )
+    parser = Parser("merge", description)
+    parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="run, or folder with runs below it")
+    parser.add_argument("--to", type=Path, required=True, metavar="FILE", help="splat file to write")
+    return parser.parse_args(arguments)
+
+
 # -- reports and facts -------------------------------------------------------------------------------------------------
 
 

@@ -35,7 +35,7 @@ More commands; view, eval and export also take splat files of other programs:
   gsx prepare FOLDER --to OUT  write a scene for other programs: photos, COLMAP model, transforms.json, test cameras
   gsx photographs RUN        find training photos with wrong exposure or pose, blur or passers-by
   gsx render RUN             save test views as PNG; animate --orbit FILE.gif or a camera --path FILE.json
-  gsx compact RUN            shrink a model while PSNR drops by at most --max-drop-db 0.1
+  gsx compact RUN            shrink a model while PSNR drops by at most 0.1 dB; merge joins runs on blocks of a scene
   gsx report DIR ...         write report.html of a run, or one page that compares all runs below some folders
   gsx explain KEY            explain a setting; gsx datasets, gsx plugins list datasets and components on this machine
 
@@ -147,6 +147,7 @@ VERBS = {
     "view": command(parsers.parse_view, "runs", "view"),
     "export": command(parsers.parse_export, "runs", "export_file"),
     "compact": command(parsers.parse_compact, "runs", "compact_model"),
+    "merge": command(parsers.parse_merge, "runs", "merge_runs"),
     "report": command(parsers.parse_report, "facts", "report"),
     "scenes": command(parsers.parse_scenes, "facts", "check_scene"),
     "prepare": command(parse_prepare, "prepare", "prepare_scene"),

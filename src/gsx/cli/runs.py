@@ -11,7 +11,9 @@ from gsx.builtin import plugins
 from gsx.cli.train import print_report
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import remove_partial
+from gsx.experiments.blocks.merge import merge_blocks
 from gsx.experiments.compact.compact import compact
+from gsx.experiments.reports.overview import runs_in
 from gsx.experiments.reports.report import write_report
 from gsx.experiments.runs import job
 from gsx.experiments.runs.compose import compose
@@ -169,3 +171,10 @@ def convert_file(source: Path, options: Namespace, spz: SpzForm) -> Path:
         raise InputError(f"gsx export: --view and --bake are for runs, {source} is a splat file: leave them out")
     convert(source, options.file, options.from_axes, spz, options.local)
     return Path(options.file)
+
+
+def merge_runs(options: Namespace) -> int:
+    """Join runs on blocks to one splat file, measure it, and print file and report."""
+    words = merge_blocks(runs_in(options.folders), options.to, plugins())
+    sys.stdout.write(f"{options.to}\n")
+    return evaluate_file(options.to, words)

@@ -8,6 +8,7 @@ from gsx.core.data.resize import FILTERS, LIGHTS
 from gsx.core.errors import ConfigError, nearest
 from gsx.core.options import without_effect
 from gsx.core.ranges import Gigabytes, Range, Share, Steps
+from gsx.scenes.blocks import parsed_block
 
 WORDS = {
     "resize_filter": FILTERS,
@@ -51,6 +52,12 @@ class SceneOptions:
         default_factory=lambda: {"exposure": 0.0, "shade": 0.0, "pose": 0.0, "blur": 0.0, "covered": 0.0, "some": 1.0}
     )
     """Degradation of training photographs, for research (gsx.experiments.runs.degraded); 0: none."""
+    block: str = ""
+    """NUMBER/COUNT: train on one of so many blocks of the scene (gsx.scenes.blocks); empty: on all of it."""
+    block_margin: Annotated[float, Range(0, 10)] = 0.2
+    """Width of the zone around a block's cell whose cameras are used, as a share of its cameras' box."""
+    block_share: Share = 0.25
+    """Share of the cell's points that a camera outside of that zone must show to be used."""
     cache_gb: Gigabytes = without_effect(default=2.0)
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
     missing: Share = without_effect(default=0.1)
@@ -69,6 +76,8 @@ class SceneOptions:
     def __post_init__(self) -> None:
         for key, words in WORDS.items():
             refuse_other(key, getattr(self, key), words)
+        if self.block:
+            parsed_block(self.block)
         if len(self.background) != 3:
             raise ConfigError(f"scene.background is {list(self.background)}, give red, green and blue in [0, 1].")
 

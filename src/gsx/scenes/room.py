@@ -1,19 +1,22 @@
 """The built-in room: plain plaster, thin legs, a few things with pattern; cameras that walk around in it.
 
-As in photographs of rooms, structure from motion finds points where there is pattern, and none on the walls. Solids,
-textures and light are those of the built-in garden; sunlight comes in from above, as there is no ceiling.
+`rooms=3` puts more of them in a row, with doorways between. As in photographs of rooms, structure from motion finds
+points where there is pattern, and none on the walls. Solids, textures and light are those of the built-in garden;
+sunlight comes in from above, as there is no ceiling.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import PointCloud, Scene
+from gsx.core.ranges import Range
 from gsx.core.shapes import Float
 from gsx.scenes.demo import textures
 from gsx.scenes.demo.cameras import even_cameras
@@ -29,6 +32,8 @@ HEIGHT, THICK = 2.4, 0.1  # of the walls
 FLOOR = 0.3  # above the garden's ground
 FIELD_OF_VIEW = math.radians(62.0)  # horizontal
 ROUNDS = 3  # of the walk
+PITCH = 2 * HALF[0] + THICK  # between the middles of neighbouring rooms
+DOOR = (1.0, 2.0)  # width and height of a doorway
 CHART = (0.52, 0.35)  # half sizes of the picture on the wall
 PLASTER = (0.87, 0.85, 0.81)
 BOARD = 0.16  # width of a floor board
@@ -95,11 +100,47 @@ def furniture() -> list[Thing]:
     ]
 
 
-def make_room() -> StillLife:
-    """Arrange the room above the garden's ground, which darkens near things."""
-    up = double((0.0, 0.0, FLOOR))
-    lifted = [replace(one, solid=replace(one.solid, centre=one.solid.centre + up)) for one in furniture()]
-    return arrange(lifted, make_kit(torch.Generator().manual_seed(SEED)))
+def doorway() -> list[Thing]:
+    """Return the wall towards the next room, which has a doorway in its middle."""
+    (x, y), (width, height) = HALF, DOOR
+    side, over = y - width / 2, HEIGHT - height
+    plaster = partial(plain, colour=PLASTER)
+    pillars = [
+        box(f"door {place}", (x + THICK / 2, place * (y + width / 2) / 2, HEIGHT / 2), (THICK, side, HEIGHT))
+        for place in (-1, 1)
+    ]
+    lintel = box("lintel", (x + THICK / 2, 0.0, height + over / 2), (THICK, width, over))
+    return [Thing(one, plaster) for one in (*pillars, lintel)]
+
+
+def room_in_row(number: int, rooms: int) -> list[Thing]:
+    """Return everything in one of several rooms; every second one is turned over from left to right."""
+    last = number == rooms - 1
+    left_out = ("west", "east")[number == 0 : 2 - last]  # of the walls between rooms
+    things = [one for one in furniture() if one.solid.name not in left_out]
+    return [placed(one, number) for one in [*things, *([] if last else doorway())]]
+
+
+def placed(thing: Thing, number: int) -> Thing:
+    """Return a thing above the garden's ground in the room of that number."""
+    turned = double((1.0, -1.0 if number % 2 else 1.0, 1.0))
+    centre = turned * thing.solid.centre + double((PITCH * number, 0.0, FLOOR))
+    return replace(thing, solid=replace(thing.solid, centre=centre))
+
+
+def make_room(rooms: int = 1) -> StillLife:
+    """Arrange rooms in a row above the garden's ground, which darkens near things."""
+    things = [thing for number in range(rooms) for thing in room_in_row(number, rooms)]
+    return arrange(things, make_kit(torch.Generator().manual_seed(SEED)))
+
+
+def touring_camera(place: float, width: int, height: int, rooms: int) -> Camera:
+    """Return the camera at `place` in [0, 1) of walks in all rooms, one after the other."""
+    number = int(rooms * place)
+    camera = walking_camera(rooms * place - number, width, height)
+    if not number:
+        return camera
+    return replace(camera, translation=camera.translation - PITCH * number * camera.rotation[:, 0])
 
 
 def walking_camera(place: float, width: int, height: int) -> Camera:
@@ -128,8 +169,18 @@ def found_points(room: StillLife, cameras: Sequence[Camera], count: int, generat
     return PointCloud(positions[chosen].contiguous(), (colours[chosen] * 255.0 + 0.5).to(torch.uint8))
 
 
-def load(options: RayCastOptions) -> Scene:
+@dataclass(frozen=True, kw_only=True)
+class RoomOptions(RayCastOptions):
+    """Options of `conf/scene/room.yaml`."""
+
+    rooms: Annotated[int, Range(1, 100)] = 1
+    """Rooms in a row, with doorways between. The default: runs older than this option."""
+
+
+def load(options: RoomOptions) -> Scene:
     """Return the room, whose pictures are rendered at first use; ConfigError: see `check`."""
     check(options)
-    cameras = even_cameras(walking_camera, "a walk", options.train_views, options.test_views, size_of(options))
-    return scene_of(options, make_room(), cameras, found_points, "room", VERSION, floor=FLOOR)
+    path, views = partial(touring_camera, rooms=options.rooms), (options.train_views, options.test_views)
+    cameras = even_cameras(path, "a walk", *views, size_of(options))
+    version = VERSION if options.rooms == 1 else f"{VERSION} {options.rooms}"
+    return scene_of(options, make_room(options.rooms), cameras, found_points, "room", version, floor=FLOOR)

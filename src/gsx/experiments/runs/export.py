@@ -76,9 +76,21 @@ def export(
     baked = explicit is None
     gaussians = bake(run, zoom or 1.0) if explicit is None else explicit
     gaussians = Gaussians(**{name: value.detach().cpu() for name, value in vars(gaussians).items()})
-    comments = [*notes(run), *stated, f"SplatRenderMode: {render_mode(run.raster)}"]
-    if baked:
-        comments.append(f"splats averaged over training cameras at {zoom or 1:g} times their resolution")
+    averaged = [f"splats averaged over training cameras at {zoom or 1:g} times their resolution"] if baked else []
+    write_model(run, gaussians, path, averaged, spz, local)
+    return Exported(gaussians=gaussians, baked=baked)
+
+
+def write_model(
+    run: Run, gaussians: Gaussians, path: Path, remarks: Sequence[str], spz: SpzForm = SPZ_FORM, local: bool = False
+) -> None:
+    """Write splats with the rules and the scene of a run as a standard splat file or a page.
+
+    Raises:
+        InputError: the format cannot hold the splats.
+    """
+    origin, stated = placement(run.scene.origin, local or is_page(path))
+    comments = [*notes(run), *stated, f"SplatRenderMode: {render_mode(run.raster)}", *remarks]
     if is_page(path):
         write_whole(path, page_of(run, gaussians, comments).encode())
     else:
@@ -86,7 +98,6 @@ def export(
         write_gaussians(path, gaussians, comments, run.raster.compensate, spz, origin)
         log_axes_written(path, spz)
     log_coordinates(path, run.scene.origin, local or is_page(path), gaussians)
-    return Exported(gaussians=gaussians, baked=baked)
 
 
 def log_axes_written(path: Path, spz: SpzForm) -> None:

@@ -17,6 +17,7 @@ from gsx.experiments.evaluation.remarks import NOT_MEASURED
 from gsx.experiments.runs.degraded import degrade
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.origin import Origin
+from gsx.scenes.blocks import BlockChoice, block_of, parsed_block
 from gsx.scenes.filling import fill_gaps
 from gsx.scenes.origin import around_origin, origin_of
 from gsx.scenes.posed import SAME_PLACE
@@ -52,6 +53,7 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
             f"all {len(scene.train)} training cameras of scene '{scene.name}' stand at one place, and no points lie "
             "elsewhere, so depth and scale are unknown: use photos from different places"
         )
+    scene = part_of(scene, options)
     if count := getattr(options, "fill", 0):
         generator = torch.Generator().manual_seed(derived_seed("fill", settings.general.seed))
         scene = fill_gaps(scene, count, generator)
@@ -60,6 +62,15 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
         generator = torch.Generator().manual_seed(derived_seed("stereo", settings.general.seed))
         scene = add_stereo_points(scene, count, generator)
     return scene
+
+
+def part_of(scene: Scene, options: Any) -> Scene:
+    """Return the block of the scene that options choose, or all of it; ConfigError: it has too few cameras."""
+    if not (word := getattr(options, "block", "")):
+        return scene
+    number, count = parsed_block(word)
+    choice = BlockChoice(number=number, count=count, margin=options.block_margin, share=options.block_share)
+    return block_of(scene, choice)
 
 
 def with_small_cache(settings: Settings) -> Settings:

@@ -1,0 +1,1 @@
+"""Models of blocks of a large scene, as one."""
