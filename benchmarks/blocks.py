@@ -1,0 +1,112 @@
+"""Blocks of a scene against the model in one piece: three built-in rooms, held-out views near the cuts and elsewhere.
+
+    python benchmarks/blocks.py [--seeds 0] [--steps 1500] [--count 3] [--runs FOLDER]
+
+Each block takes --steps, and the model in one piece as many as all blocks together. It may grow to 30,000 primitives,
+each block to half of that, since it also learns what is around its cell. Finished runs are kept. Ten minutes a seed on
+one core.
+"""
+
+import argparse
+import statistics
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from gsx.builtin import plugins
+from gsx.core.files import read_json
+from gsx.experiments.runs.compose import compose
+from gsx.experiments.runs.load_scene import load_scene
+from gsx.formats.splat_files import read_splats
+from gsx.scenes.blocks import centres_of, scene_cells
+from measuring.machine import describe_machine, shown_command, told_load
+from measuring.results import Section, stamped, text_table, write_results
+from measuring.runs import gsx, train
+
+RESULTS = Path(__file__).parent / "results"
+SCENE = ("scene=room", "scene.rooms=3", "scene.train_views=180", "scene.test_views=18", "scene.points=9000")
+QUICK = ("training.cooldown=0.25", "training.supersampling.start=0.95", "backbone.density.reset_every=1000000")
+WHOLE, NEAR = 30_000, 1.2
+"""Primitives of the model in one piece, and distance from a cut within which a test camera is near it, scene units."""
+COLUMNS = [
+    *(["seed", "seed"], ["model", "model"], ["x1", "x1, dB"], ["x4", "x4, dB"], ["near", "near cuts, dB"]),
+    *(["far", "elsewhere, dB"], ["worst", "worst view, dB"], ["primitives", "primitives"], ["seconds", "training, s"]),
+]
+Row = dict[str, object]
+
+
+def words_for(seed: int, steps: int, primitives: int) -> list[str]:
+    """The settings of a run."""
+    budget = ("backbone.capacity=budget", f"backbone.budget.primitives={primitives}")
+    return [*SCENE, *QUICK, *budget, f"seed={seed}", f"iterations={steps}", "eval.zoom=[1,2,4]", "rasterizer=compiled"]
+
+
+def views_near_cuts(count: int) -> set[str]:
+    """Names of the test views whose cameras are near a cut."""
+    scene = load_scene(compose(SCENE, plugins()))
+    cuts = torch.stack([torch.stack([cell.low, cell.high]) for cell in scene_cells(scene, count)]).view(-1, 3)
+    apart = (centres_of(scene.test)[:, None] - cuts).abs().amin((1, 2))
+    return {view.name for view, distance in zip(scene.test, apart.tolist(), strict=True) if distance < NEAR}
+
+
+def figures(folder: Path, near: set[str]) -> Row:
+    """The figures of an evaluation."""
+    found = read_json(folder / "evaluation.json")
+    levels = {view["name"]: view["psnr"] for view in found["views"]}
+    return {
+        "x1": found["psnr"],
+        "x4": found["zoom"]["4"]["psnr"],
+        "near": statistics.fmean(level for name, level in levels.items() if name in near),
+        "far": statistics.fmean(level for name, level in levels.items() if name not in near),
+        "worst": min(levels.values()),
+        "primitives": found["primitives"],
+    }
+
+
+def measure(seed: int, options: argparse.Namespace, near: set[str]) -> list[Row]:
+    """Trains the scene in one piece and in blocks."""
+    count, base = options.count, options.runs / f"{seed}_{options.steps}"
+    whole = train(base / "whole", words_for(seed, options.steps * count, WHOLE))
+    seconds = [
+        train(base / f"block_{number}", [*words_for(seed, options.steps, WHOLE // 2), f"scene.block={number}/{count}"])[
+            "train_seconds"
+        ]
+        for number in range(1, count + 1)
+    ]
+    merged, file = base / "merged", base / "merged.ply"
+    if not (merged / "evaluation.json").is_file():
+        gsx(["merge", *(str(base / f"block_{number}") for number in range(1, count + 1)), "--to", str(file)])
+        gsx(["eval", str(file), *SCENE, "eval.zoom=[1,2,4]", f"folder={merged}"])
+    rows = [
+        {"model": "in one piece", "seconds": whole["train_seconds"]} | figures(base / "whole", near),
+        {"model": f"{count} blocks, merged", "seconds": sum(seconds)} | figures(merged, near),
+    ]
+    assert rows[1]["primitives"] == len(read_splats(file).gaussians.means)
+    return [{"seed": seed} | row for row in rows]
+
+
+def main(words: Sequence[str]) -> None:
+    """Trains, merges and writes the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="0", help="by commas (0)")
+    parser.add_argument("--steps", type=int, default=1500, help="steps of a block (1500)")
+    parser.add_argument("--count", type=int, default=3, help="blocks (3)")
+    parser.add_argument("--runs", type=Path, default=Path("outputs/blocks"), help="folder of the runs")
+    parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the results")
+    options, load = parser.parse_args(words), told_load()
+    near = views_near_cuts(options.count)
+    rows = [row for seed in options.seeds.split(",") for row in measure(int(seed), options, near)]
+    notes = [
+        f"Held-out views; {len(near)} of 18 are within {NEAR:g} units of a cut. A block takes {options.steps:,} steps, "
+        f"the model in one piece {options.count * options.steps:,}. Seconds of all blocks, one after the other."
+    ]
+    command = shown_command(words, "benchmarks/blocks.py")
+    sections: dict[str, Section] = {"blocks": stamped("Blocks and one piece", COLUMNS, rows, notes, load, command)}
+    write_results(options.to, "blocks_cpu", describe_machine(torch.device("cpu")), sections)
+    print(text_table(sections["blocks"]))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
