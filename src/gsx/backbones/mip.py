@@ -191,6 +191,8 @@ def visible_depths(
     depth = local[:, 2].clamp_min(LEAST_DEPTH)
     column = local[:, 0] / depth * camera.fx + camera.cx
     row = local[:, 1] / depth * camera.fy + camera.cy
+    if camera.lens is not None:
+        column, row = camera.project(points)[0].unbind(1)
     across = (column >= -options.margin * camera.width) & (column <= (1 + options.margin) * camera.width)
     down = (row >= -options.margin * camera.height) & (row <= (1 + options.margin) * camera.height)
     return depth, (local[:, 2] > options.near) & across & down

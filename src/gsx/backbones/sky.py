@@ -170,8 +170,8 @@ def upwards_in(view: View, up: Float[Tensor, "3"]) -> Float[Tensor, "2"]:
 
 def rays_of(camera: Camera, pixels: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
     """Returns world directions of pixels, at depth 1."""
-    x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
-    return torch.stack([x, y, torch.ones_like(x)], 1) @ camera.rotation.float()
+    slopes = camera.slopes(pixels)
+    return torch.cat([slopes, torch.ones_like(slopes[:, :1])], 1) @ camera.rotation.float()
 
 
 def centre_of(views: Sequence[View]) -> Float[Tensor, "3"]:

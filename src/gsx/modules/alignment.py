@@ -16,6 +16,7 @@ from torch.nn.functional import grid_sample
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.masks import grown
+from gsx.core.errors import ConfigError
 from gsx.core.shapes import Bool, Float
 from gsx.formats.turned import cross_matrix
 from gsx.modules.image_shift import (
@@ -141,6 +142,12 @@ class Reference:
         if self.excluded is not None:
             valid = valid & (sample_image(self.excluded, pixels, "nearest")[0] == 0)
         return pixels, valid
+
+
+def refuse_lens(camera: Camera) -> None:
+    """Raises ConfigError for a camera with a lens: poses are estimated by the derivatives of a pinhole."""
+    if camera.lens is not None:
+        raise ConfigError("poses are not estimated through a lens: set scene.lens=undistort, or switch poses off")
 
 
 def estimate_camera(

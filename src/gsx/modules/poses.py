@@ -24,7 +24,7 @@ from gsx.core.training.module import ModuleContext
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.formats.turned import cross_matrix
-from gsx.modules.alignment import Motion, estimate_camera, median_depth, motion_to, rotation_by
+from gsx.modules.alignment import Motion, estimate_camera, median_depth, motion_to, refuse_lens, rotation_by
 from gsx.modules.corrections import Correction, CorrectionOptions, Times, ViewCache, ViewCount, log_test, sample
 from gsx.modules.derived_views import change_pose, reduce_view
 from gsx.modules.image_shift import estimate_shift
@@ -66,6 +66,8 @@ class Poses(Correction):
 
     def __init__(self, options: PoseOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
+        for view in context.scene.train if options.when != "never" else ():
+            refuse_lens(view.camera)
         self.matrices: Float[Tensor, "N 3 4"] | None = None
         """camera_from_world, rotation and translation; None: the scene's."""
         self.error = math.nan

@@ -32,7 +32,7 @@ from gsx.scenes.colmap_folders import (
 from gsx.scenes.colmap_model import Model, ModelImage, error_words, read_model
 from gsx.scenes.duplicates import photos_of, refuse_file_twice
 from gsx.scenes.masked import IMAGES, mask_notes
-from gsx.scenes.observations import Unmeasured, counted, known, straight_keypoints
+from gsx.scenes.observations import Unmeasured, counted, known, straight_keypoints, with_rays
 from gsx.scenes.options import SceneOptions, refuse_other
 from gsx.scenes.orientation import RULES, TurnsOf, of_model, oriented_size
 from gsx.scenes.photo_names import similar_photo
@@ -85,7 +85,13 @@ def build(
     present, absent_note = present_images(model, photos, options.missing)
     shots = [
         shot_through(
-            model.cameras[image.camera_id], image.name, photos / image.name, image.rotation, image.translation, turns_of
+            model.cameras[image.camera_id],
+            image.name,
+            photos / image.name,
+            image.rotation,
+            image.translation,
+            turns_of,
+            options.lens == "native",
         )
         for image in present
     ]
@@ -167,11 +173,12 @@ def check_cameras(
 def reprojection_errors(image: ModelImage, intrinsics: Any, camera: Camera) -> Float[Tensor, "K"]:
     """Return distances of projected points from their keypoints in pixels of the model.
 
-    Points behind the camera have infinity, keypoints without a ray NaN. `camera` is the image's pinhole camera on any
-    raster, `intrinsics` the model's pycolmap camera.
+    Points behind the camera have infinity, keypoints without a ray NaN. `camera` is the image's camera on any raster,
+    `intrinsics` the model's pycolmap camera.
     """
-    pinhole = pinhole_of(intrinsics)
-    observed = straight_keypoints(image, intrinsics)
+    undistorted = camera.lens is None
+    pinhole = pinhole_of(intrinsics) if undistorted else intrinsics
+    observed = straight_keypoints(image, intrinsics) if undistorted else with_rays(image.keypoints, intrinsics)
     projected, depth = camera.project(image.observed)
     to_model = projected.new_tensor([pinhole.width / camera.width, pinhole.height / camera.height])
     errors = (projected * to_model - observed).norm(dim=1)

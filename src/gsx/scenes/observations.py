@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from gsx.core.shapes import Bool, Float
 from gsx.scenes.colmap_model import Model, ModelImage
 from gsx.scenes.pose_files import some_names
-from gsx.scenes.undistort import pinhole_of, undistort_points
+from gsx.scenes.undistort import pinhole_of, rays_of, undistort_points
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,11 @@ class Unmeasured:
 def straight_keypoints(image: ModelImage, intrinsics: Any) -> Float[Tensor, "K 2"]:
     """Return keypoints in px of the pinhole of `intrinsics`, a pycolmap camera; NaN for those without a ray."""
     return undistort_points(intrinsics, pinhole_of(intrinsics), image.keypoints)
+
+
+def with_rays(keypoints: Float[Tensor, "K 2"], intrinsics: Any) -> Float[Tensor, "K 2"]:
+    """Return keypoints in px of a pycolmap camera; NaN for those without a ray."""
+    return torch.where(rays_of(intrinsics, keypoints).isfinite(), keypoints, torch.nan)
 
 
 def known(pixels: Float[Tensor, "K 2"]) -> Bool[Tensor, "K"]:

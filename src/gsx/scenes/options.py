@@ -16,6 +16,7 @@ WORDS = {
     "principal_point": ("exact", "centred"),
     "masks": ("auto", "alpha", "none"),
     "orientation": ("auto", "stored", "turned"),
+    "lens": ("undistort", "native"),
 }
 """Values of options that are words."""
 
@@ -69,6 +70,9 @@ class SceneOptions:
     """Use of EXIF's orientation by scene=photos, colmap and transforms (gsx.scenes.orientation). auto: photos and
     cameras are turned upright from the raster of the cameras: the stored one, or the turned one where only that has
     their shape; stored: not at all; turned: cameras are those of turned photos, of any shape."""
+    lens: str = "undistort"
+    """Use of photos with distortion. undistort: they are resampled to a pinhole's; native: they stay, and are rendered
+    through their lens (docs/how-to/lenses.md)."""
     split: str = "every:8"
     """every:K | sharp:K | files:train.txt,test.txt | counts:N_TRAIN,N_TEST | none: train on all, measure nothing
     (gsx.scenes.splits)."""

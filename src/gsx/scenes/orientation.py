@@ -4,17 +4,18 @@ Programs such as COLMAP define cameras on the stored raster: photos of one lens 
 Here a photo is undistorted on that raster, and then turned upright together with its camera.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera
+from gsx.core.data.camera import Camera, LensModel
 from gsx.core.data.images import image_size, is_reduction
 from gsx.core.data.resize import Size
 from gsx.core.shapes import UInt8
+from gsx.lenses import Distortion
 from gsx.scenes.exif import orientation_of
 
 Remap = Callable[[UInt8[Tensor, "C H W"]], UInt8[Tensor, "C h w"]]
@@ -63,7 +64,13 @@ def oriented_camera(camera: Camera, orientation: int) -> Camera:
         cy=height - cy if down < 0 else cy,
         width=width,
         height=height,
+        lens=turned_lens(camera.lens, turn[:2, :2].flatten().tolist()),
     )
+
+
+def turned_lens(lens: LensModel | None, turn: Sequence[float]) -> LensModel | None:
+    """Return the lens of a camera rolled by a 2 x 2 matrix, in rows."""
+    return lens.turned(turn) if isinstance(lens, Distortion) else lens
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,10 +9,11 @@ from torch import Tensor
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import ImageCache, composite, has_alpha, read_image, refuse_other_size
 from gsx.core.data.masks import Mask, untouched
-from gsx.core.data.resize import ResizeRule, Size, resize
+from gsx.core.data.resize import REACH, ResizeRule, Size, resize
 from gsx.core.data.window import Window
 from gsx.core.errors import InputError
 from gsx.core.shapes import Bool, UInt8
+from gsx.lenses.rays import pixels_with_rays
 
 ZOOM_SLACK = 1.01  # sizes are rounded to whole pixels, so four times a quarter can be a little more than all
 
@@ -45,12 +46,17 @@ class PhotoSource:
         return window.cut(self.cache.get(key, lambda: self._resized(width, height)))
 
     def counted(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
-        """Return which pixels of `image(camera)` count; None: all. InputError: the mask leaves none, or is damaged."""
+        """Return which pixels of `image(camera)` count; None: all. InputError: the mask leaves none, or is damaged.
+
+        Those of the mask, and pixels made from some without a ray, do not count.
+        """
+        rays = pixels_with_rays(camera, REACH.get(self.rule.filter, 0))
         if self.mask is None:
-            return None
+            return rays
         window, width, height = self.window_of(camera)
         mask, key = self.mask, (str(self.mask.path), "mask", self.rule, self.remap, width, height)
-        return window.cut(self.cache.get(key, lambda: self._counted(mask, width, height)))[0]
+        counted = window.cut(self.cache.get(key, lambda: self._counted(mask, width, height)))[0]
+        return counted if rays is None else counted & rays
 
     def transparent(self, camera: Camera) -> Bool[Tensor, "h w"] | None:
         """Return which pixels of `image(camera)` are made from transparent ones alone, and hold nothing of the scene.

@@ -17,6 +17,7 @@ from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.errors import InputError
 from gsx.core.files import expand_home
 from gsx.core.shapes import Float
+from gsx.lenses import lens_of
 from gsx.scenes.duplicates import refuse_shared
 from gsx.scenes.masked import mask_of, masks_named
 from gsx.scenes.options import SceneOptions
@@ -69,17 +70,23 @@ def shot_through(
     rotation: Float[Tensor, "3 3"],
     translation: Float[Tensor, "3"],
     turns_of: TurnsOf = of_model,
+    native: bool = False,
 ) -> Shot:
-    """Return a photo taken by the pycolmap camera `intrinsics` as the pinhole photo that gsx uses.
+    """Return a photo taken by the pycolmap camera `intrinsics`, undistorted to a pinhole's or with its lens (`native`).
 
     `turns_of` finds its turns by the file and the raster of `intrinsics` (`gsx.scenes.orientation.RULES`).
 
     Raises:
-        InputError: the photo's size is no uniform reduction of the camera's, or that has no pinhole equivalent.
+        InputError: the photo's size is no uniform reduction of the camera's, or that has no pinhole equivalent, or its
+            lens is not rendered.
     """
+    expected = intrinsics.width, intrinsics.height
     try:
-        pinhole, expected = pinhole_of(intrinsics), (intrinsics.width, intrinsics.height)
+        lens = lens_of(intrinsics) if native else None
+        pinhole = intrinsics if native else pinhole_of(intrinsics)
     except InputError as problem:
+        if native:
+            raise InputError(f"'{photo}': {problem}") from None
         raise InputError(f"'{photo}' cannot be undistorted: {problem}") from None
     turns = turns_of(photo, expected)
     size = oriented_size(image_size(photo), turns.first)
@@ -88,7 +95,7 @@ def shot_through(
     return Shot(
         name=name,
         photo=photo,
-        whole=camera_of(pinhole, rotation, translation).resize(*size),
+        whole=replace(camera_of(pinhole, rotation, translation).resize(*size), lens=lens),
         expected_size=expected,
         remap=None if pinhole is intrinsics else StoredUndistortion(photo, intrinsics, pinhole, size, turns.first),
         turns=turns,
@@ -114,7 +121,10 @@ def shot_notes(shots: Sequence[Shot]) -> list[str]:
 
 
 def lens_notes(shots: Sequence[Shot]) -> list[str]:
-    """Return one note for each kind of camera that is undistorted."""
+    """Return one note for each kind of camera that is undistorted, and one on those that are not."""
+    native = sum(shot.whole.lens is not None for shot in shots)
+    if native:
+        return [f"{native} of {len(shots)} photos are rendered through their lens (scene.lens=native)."]
     kinds = {
         (remap.intrinsics.model_name, shot.expected_size, shot.whole.size, cut_note(remap.intrinsics))
         for shot in shots
@@ -234,4 +244,5 @@ def provenance(options: SceneOptions, views: Sequence[View]) -> dict[str, Any]:
         "number_of_images": len(views),
         **masks_named(views),
         **({"turned": turned} if turned else {}),
+        **({"lens": options.lens} if options.lens != "undistort" else {}),
     }

@@ -174,17 +174,20 @@ def projected_at(
     move = other.translation.double() - turn @ camera.translation.double()
     x, y, z = ((turn @ rays).float() * depths[:, None, None] + move.float()[:, None]).unbind(1)
     safe = z.clamp_min(1e-6)
-    across = 2 * (x / safe * other.fx + other.cx) / other.width - 1
-    down = 2 * (y / safe * other.fy + other.cy) / other.height - 1
+    right, below = x / safe, y / safe
+    if other.lens is not None:
+        right, below = other.lens.bend(torch.stack([x, y, z], -1).flatten(0, -2)).T.reshape(2, *x.shape)
+    across = 2 * (right * other.fx + other.cx) / other.width - 1
+    down = 2 * (below * other.fy + other.cy) / other.height - 1
     inside = (across.abs() < 1) & (down.abs() < 1) & (z > other.near)
-    places = torch.stack([across, down], -1).clamp(-2, 2)
+    places = torch.stack([across, down], -1).nan_to_num(2.0).clamp(-2, 2)
     return places.reshape(-1, width, 2), inside.reshape(-1, height, width)
 
 
 def camera_rays(camera: Camera) -> Float[Tensor, "3 P"]:
     """Returns the directions of pixels at depth 1, camera coordinates, float64."""
-    x, y = pixel_centres(camera).double().T
-    return torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)])
+    x, y = camera.slopes(pixel_centres(camera).double()).T
+    return torch.stack([x, y, torch.ones_like(x)])
 
 
 def pixel_centres(camera: Camera) -> Float[Tensor, "P 2"]:

@@ -1,7 +1,7 @@
 """Scenes of transforms.json as nerfstudio and instant-ngp write it, or of a file to train on and one to test on.
 
 Poses are camera-to-world with OpenGL axes. Poses and points are used as stored: nerfstudio has already applied its
-`applied_transform` and `applied_scale` to both. Photos with distortion are undistorted as in COLMAP scenes. Depth maps
+`applied_transform` and `applied_scale` to both. Photos with distortion are treated as in COLMAP scenes. Depth maps
 (`depth_file_path`) are not used.
 """
 
@@ -59,7 +59,8 @@ def load(options: TransformsOptions) -> Scene:
     shots, counts, notes, rule = list[Shot](), list[int](), list[str](), RULES[options.orientation]
     for part in parts:
         present, absent = present_frames(part.file.parent, part.frames, part.file, options.missing)
-        shots += [_shot(complete_frame(part.content, frame), photo, part.file, rule) for frame, photo in present]
+        frames = [(complete_frame(part.content, frame), photo) for frame, photo in present]
+        shots += [_shot(frame, photo, part.file, rule, options.lens == "native") for frame, photo in frames]
         counts.append(len(present))
         notes += absent
     views = views_of(shots, options)
@@ -73,12 +74,12 @@ def load(options: TransformsOptions) -> Scene:
     return scene_of(options, parts[0].file.parent, views, sides, points, notes, details)
 
 
-def _shot(entry: Mapping[str, Any], photo: Path, file: Path, turns_of: TurnsOf) -> Shot:
+def _shot(entry: Mapping[str, Any], photo: Path, file: Path, turns_of: TurnsOf, native: bool) -> Shot:
     """Return the shot of a frame that is completed by the file's common values."""
     name = plain_name(entry["file_path"])
     place = f"Frame '{name}' of '{file}'"
     rotation, translation = pose_from_opengl(entry.get("transform_matrix"), place)
-    shot = shot_through(lens_of(entry, photo, place), name, photo, rotation, translation, turns_of)
+    shot = shot_through(lens_of(entry, photo, place), name, photo, rotation, translation, turns_of, native)
     mask = entry.get("mask_path")
     return shot if mask is None else replace(shot, mask=file.parent / plain_name(str(mask)))
 

@@ -1,4 +1,4 @@
-"""Pinhole cameras.
+"""Pinhole cameras, and cameras with a lens.
 
 Conventions (docs/reference/conventions.md): x right, y down, z forward (OpenCV); pixel centres at +0.5, so the raster
 covers [0, width] x [0, height]; the principal point (cx, cy) may lie outside the raster, as in crops.
@@ -7,6 +7,7 @@ covers [0, width] x [0, height]; the principal point (cx, cy) may lie outside th
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -39,9 +40,49 @@ class Frame:
         return Frame(left=round(left), top=round(top), width=round(width), height=round(height))
 
 
+@runtime_checkable
+class LensModel(Protocol):
+    """Distortion of a camera, from slopes x/z and y/z to distorted ones, to which fx, fy, cx, cy apply.
+
+    It knows no raster, so crops and zooms of a camera share it. Lenses of the same pictures are equal.
+    """
+
+    def bend(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 2"]:
+        """Returns distorted slopes of points in camera coordinates; NaN where the lens shows none."""
+
+    def straighten(self, slopes: Float[Tensor, "P 2"]) -> Float[Tensor, "P 2"]:
+        """Returns slopes of rays by their distorted slopes; NaN where there is no ray."""
+
+    def visible(
+        self,
+        points: Float[Tensor, "N 3"],
+        scales: Float[Tensor, "N 3"],
+        quats: Float[Tensor, "N 4"],
+        rotation: Float[Tensor, "3 3"],
+        low: Float[Tensor, "2"],
+        high: Float[Tensor, "2"],
+    ) -> Bool[Tensor, "N"]:
+        """Marks Gaussians that `geometry` projects; distorted slopes of the frame lie between low and high."""
+
+    def geometry(
+        self,
+        points: Float[Tensor, "M 3"],
+        scales: Float[Tensor, "M 3"],
+        quats: Float[Tensor, "M 4"],
+        rotation: Float[Tensor, "3 3"],
+        intrinsics: Float[Tensor, "4"],
+        low: Float[Tensor, "2"],
+        high: Float[Tensor, "2"],
+        dilation: Float[Tensor, "1"],
+        compensate: bool,
+        drawn: Float[Tensor, "1"] | None = None,
+    ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M"] | None]:
+        """Projects Gaussians, as `gsx.core.rasterizer.geometry.geometry`."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Camera:
-    """Pinhole camera: x_camera = rotation @ x_world + translation, pixel = (fx x/z + cx, fy y/z + cy)."""
+    """Camera: x_camera = rotation @ x_world + translation, pixel = (fx x/z + cx, fy y/z + cy); a lens bends slopes."""
 
     rotation: Float[Tensor, "3 3"]
     """Rotation, camera from world."""
@@ -57,6 +98,8 @@ class Camera:
     """Largest depth at which splats are not drawn, scene units."""
     cut_from: Frame | None = None
     """Frame of a crop; None: no crop."""
+    lens: LensModel | None = None
+    """None: a pinhole."""
 
     @property
     def frame(self) -> Frame:
@@ -94,7 +137,7 @@ class Camera:
 
     def draws_as(self, other: "Camera") -> bool:
         """Returns whether both draw pictures of the same bits."""
-        numbers = ("fx", "fy", "cx", "cy", "width", "height", "near", "frame")
+        numbers = ("fx", "fy", "cx", "cy", "width", "height", "near", "frame", "lens")
         alike = all(getattr(self, name) == getattr(other, name) for name in numbers)
         return alike and self.has_pose_of(other)
 
@@ -144,17 +187,21 @@ class Camera:
         return self.crop((self.width - width) // 2, (self.height - height) // 2, width, height)
 
     def project(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P"]]:
-        """Returns pixel positions (invalid at depths <= 0) and depths of world points."""
+        """Returns pixel positions (invalid at depths <= 0; NaN where a lens has none) and depths of world points."""
         camera_points = self.to_camera(points)
         depth = camera_points[:, 2]
         focal, centre = depth.new_tensor([self.fx, self.fy]), depth.new_tensor([self.cx, self.cy])
-        return (camera_points[:, :2] / depth[:, None] * focal + centre).to(points), depth.to(points)
+        slopes = camera_points[:, :2] / depth[:, None] if self.lens is None else self.lens.bend(camera_points)
+        return (slopes * focal + centre).to(points), depth.to(points)
+
+    def slopes(self, pixels: Float[Tensor, "P 2"]) -> Float[Tensor, "P 2"]:
+        """Returns x/z and y/z of the rays through pixel positions; NaN where a lens has none."""
+        slopes = torch.stack([(pixels[:, 0] - self.cx) / self.fx, (pixels[:, 1] - self.cy) / self.fy], 1)
+        return slopes if self.lens is None else self.lens.straighten(slopes)
 
     def unproject(self, pixels: Float[Tensor, "P 2"], depths: Float[Tensor, "P"]) -> Float[Tensor, "P 3"]:
         """Returns world points at pixel positions and depths."""
-        x = (pixels[:, 0] - self.cx) / self.fx * depths
-        y = (pixels[:, 1] - self.cy) / self.fy * depths
-        points = torch.stack([x, y, depths], 1).double()
+        points = torch.cat([self.slopes(pixels) * depths[:, None], depths[:, None]], 1).double()
         return ((points - self.translation.double()) @ self.rotation.double()).float()
 
 

@@ -4,6 +4,7 @@ Vectors are tuples of columns, one tensor [M] per component: on a CPU three time
 """
 
 from functools import reduce
+from itertools import combinations
 from operator import add
 from typing import TypeAlias
 
@@ -28,6 +29,13 @@ def cross(a: Columns, b: Columns) -> Columns:
     """Returns a x b."""
     (ax, ay, az), (bx, by, bz) = a, b
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+def minors(a: Columns, b: Columns) -> Columns:
+    """Returns all a_i b_j - a_j b_i of vectors of any length; of three components, those of a x b."""
+    if len(a) == 3:
+        return cross(a, b)
+    return tuple(a[i] * b[j] - a[j] * b[i] for i, j in combinations(range(len(a)), 2))
 
 
 def plus(a: Columns, factor: Tensor | float, b: Columns) -> Columns:
@@ -76,7 +84,8 @@ def covariance_and_factor(p: Columns, q: Columns, dilation: Float[Tensor, "1"]) 
     """
     pp, pq, qq = dot(p, p), dot(p, q), dot(q, q)
     xx, yy = pp + dilation, qq + dilation
-    area = scaled(cross(p, q), (yy.rsqrt(),) * 3)  # p x q / sqrt(yy)
+    areas = minors(p, q)
+    area = scaled(areas, (yy.rsqrt(),) * len(areas))  # p x q / sqrt(yy)
     bare, added = dot(area, area), dilation * (pp / yy + 1)  # determinants / yy: squares of px, not fourth powers
     u0 = (2 * (bare + added)).rsqrt()
     return (xx, pq, yy), (u0, -pq / yy * u0, (2 * yy).rsqrt()), (bare, added)
@@ -104,6 +113,18 @@ def log_exchange(
     """
     before = bare + drawn * ((dot(p, p) + dot(q, q) + drawn) / yy)
     return (before.log() - (bare + added).log()) / 2
+
+
+def shape_of(
+    p: Columns, q: Columns, dilation: Float[Tensor, "1"], compensate: bool, drawn: Float[Tensor, "1"] | None
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M"] | None]:
+    """Returns dilated covariances, their factors, and ln of the opacity factor or None, as `geometry`."""
+    covariances, conic_factors, determinants = covariance_and_factor(p, q, dilation)
+    compensation = log_compensation(*determinants) if compensate else None
+    if drawn is not None:
+        bare, added = determinants
+        compensation = log_exchange(p, q, bare, added, covariances[2], drawn)
+    return torch.stack(covariances, 1), torch.stack(conic_factors, 1), compensation
 
 
 def geometry(
@@ -134,9 +155,4 @@ def geometry(
     stretches, magnification = ((fx / longest).to(scales), (fy / longest).to(scales)), (longest / z).to(scales)
     sizes = scaled(scales.unbind(1), (magnification,) * 3)
     p, q = screen_axes(clamped, stretches, sizes, unit(quats), rotation)
-    covariances, conic_factors, determinants = covariance_and_factor(p, q, dilation)
-    compensation = log_compensation(*determinants) if compensate else None
-    if drawn is not None:
-        bare, added = determinants
-        compensation = log_exchange(p, q, bare, added, covariances[2], drawn)
-    return torch.stack(means, 1).to(scales), torch.stack(covariances, 1), torch.stack(conic_factors, 1), compensation
+    return torch.stack(means, 1).to(scales), *shape_of(p, q, dilation, compensate, drawn)

@@ -100,18 +100,20 @@ def project(
     points = camera.to_camera(splats.means)
     device = splats.means.device.type
     good, visible = select_splats(splats, points, numbers, settings.backend.on(device) if len(splats) > 1 else EAGER)
+    shape = numbers[:4], numbers[4:6].to(splats.scales), numbers[6:8].to(splats.scales)
+    rotation = upload(camera.rotation, points.device, splats.scales.dtype)
+    if camera.lens is not None:
+        visible &= camera.lens.visible(points, splats.scales, splats.quats, rotation, *shape[1:])
     fields = (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
     ids, dropped = chosen_rows(good, visible)  # before any division
     points, scales, quats, log_opacities, channels = (take_rows(values, ids) for values in fields)
     compensate = settings.compensate and settings.published_dilation
     # tensors of one element: torch would compile again for each number, and for each 0-dimensional float64 tensor
     rules = scales.new_full((1,), dilation), compensate, scales.new_full((1,), drawn) if drawn else None
-    shape = numbers[:4], numbers[4:6].to(scales), numbers[6:8].to(scales)
     backend = settings.backend.on(device, learning=True) if len(ids) > 1 else EAGER
-    compute = backend.kernel(geometry, variant=(compensate, bool(drawn)))
-    means, covariances, conic_factors, compensation = compute(
-        points, scales, quats, upload(camera.rotation, ids.device, scales.dtype), *shape, *rules
-    )
+    compiled = backend.kernel(geometry, variant=(compensate, bool(drawn)))
+    compute = compiled if camera.lens is None else camera.lens.geometry
+    means, covariances, conic_factors, compensation = compute(points, scales, quats, rotation, *shape, *rules)
     if drawn and compensation is not None:  # opacities stay at most alpha_max
         most = log_opacities.clamp_min(math.log(settings.alpha_max))
         compensation = torch.minimum(compensation, most - log_opacities)

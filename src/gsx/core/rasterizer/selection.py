@@ -64,10 +64,12 @@ def lens_of(
 ) -> Float[Tensor, "16"]:
     """Returns the numbers of a `Lens`, differentiable in `intrinsics`, which are on the frame."""
     frame, around = camera.frame, max(WINDOW_TILE, settings.tile_size)
-    edges = (
+    edges: tuple[float, ...] = (
         *(frame.left - around, frame.left + camera.width + around),
         *(frame.top - around, frame.top + camera.height + around),
     )
+    if camera.lens is not None:  # bounds of a pinhole do not hold: the lens selects
+        edges = (-math.inf, math.inf, -math.inf, math.inf)
     limit = math.sqrt(2 * (OPACITY_SLACK - math.log(settings.alpha_min) + CUTOFF_SLACK))
     numbers = intrinsics.new_tensor([camera.near, dilation, *edges, max(3.0, limit)])
     stretch = torch.linalg.norm(camera.rotation.detach().to(intrinsics), 2).clamp_min(1)[None]

@@ -19,7 +19,7 @@ from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.surface_errors import ExactDepth, mean_depth, surface_errors
 from gsx.experiments.evaluation.warp import Surface, surface_of
 from gsx.experiments.evaluation.zoomed import Zoomed
-from gsx.modules.alignment import estimate_camera
+from gsx.modules.alignment import estimate_camera, refuse_lens
 
 ALIGNMENTS = 2
 """Number of times that a pose moves to where its photo was taken, each time by a new render."""
@@ -105,6 +105,7 @@ def half(view: View, counted: Bool[Tensor, "H W"] | None, right: bool) -> Bool[T
 def align_camera(run: Run, view: View) -> Camera:
     """Returns the camera where the model says that a view was taken, by its left half."""
     left, camera = half(view, view.counted(), right=False), view.camera
+    refuse_lens(camera)
     for _ in range(ALIGNMENTS):
         rendering = render(run, camera, supersample=1, depth=True)
         assert rendering.depth is not None

@@ -76,7 +76,7 @@ def points_of(surface: Surface, indices: Int[Tensor, "P"]) -> Float[Tensor, "3 P
     camera = surface.camera
     depths = surface.depth.flatten()[indices].double()
     column, row = (indices % camera.width).double(), (indices // camera.width).double()
-    across, down = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
+    across, down = camera.slopes(torch.stack([column, row], 1) + 0.5).T
     return torch.stack([across * depths, down * depths, depths])
 
 
@@ -84,6 +84,8 @@ def project(camera: Camera, points: Float[Tensor, "3 P"]) -> tuple[Float[Tensor,
     """Returns places, px, and depths of points in a camera's frame; places before its near plane are far outside."""
     x, y, z = points
     deep = z.clamp_min(camera.near)
+    if camera.lens is not None:
+        x, y = deep * camera.lens.bend(points.T).nan_to_num(-1e9).T
     places = torch.stack([camera.fx * x / deep + camera.cx, camera.fy * y / deep + camera.cy])
     return torch.where(z > camera.near, places, -1e9), z
 

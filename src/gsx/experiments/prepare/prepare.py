@@ -12,6 +12,7 @@ from torch import Tensor
 from gsx import __version__
 from gsx.core.data.images import write_image
 from gsx.core.data.scene import View
+from gsx.core.errors import ConfigError
 from gsx.core.files import finite, replace_text, write_json
 from gsx.core.plugins import Plugins
 from gsx.core.shapes import UInt8
@@ -63,6 +64,8 @@ def prepare(
     settings = with_small_cache(compose(words, plugins))
     refuse_inside(to, getattr(settings.scene.options, "path", ""))
     scene = load_scene(settings)
+    if any(view.camera.lens is not None for view in [*scene.train, *scene.test]):
+        raise ConfigError("gsx prepare writes pinhole cameras: leave scene.lens=native out")
     for note in scene.notes:
         logger.info("note: %s", note)
     content = content_of(scene, settings.evaluation.zoom, with_test, with_truth)

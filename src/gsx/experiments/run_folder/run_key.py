@@ -28,6 +28,8 @@ NOT_COMPARED = "eval.competitor"
 UNCHANGED = {
     "scene.model": "auto",
     "scene.distances": "even",
+    "scene.lens": "undistort",
+    "scene.fisheye": 0.0,
     "scene.stereo": 0,
     "scene.rooms": 1,
     "scene.block": "",

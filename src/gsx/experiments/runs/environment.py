@@ -65,6 +65,8 @@ def environment(run: Run, plugins: Plugins, idle: Collection[str]) -> dict[str, 
 def camera_digest(views: Sequence[View]) -> str:
     """Return a digest of names, sizes, intrinsics and poses of views, in order."""
     content = hashlib.sha256(repr([(view.name, view.camera.size) for view in views]).encode())
+    lenses = [view.camera.lens for view in views if view.camera.lens is not None]
+    content.update(repr(lenses).encode() if lenses else b"")
     cameras = [view.camera for view in views]
     numbers = [torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float64)]
     numbers += [torch.stack([c.rotation.double().flatten() for c in cameras])]

@@ -197,6 +197,8 @@ def reaching(gaussians: Gaussians, camera: Camera, sigmas: float) -> Bool[Tensor
     x, y, z = camera.to_camera(gaussians.means).unbind(1)
     radius = sigmas * camera.focal * gaussians.log_scales.double().amax(1).exp() / z.clamp_min(1e-12)
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    if camera.lens is not None:
+        u, v = camera.project(gaussians.means.double())[0].unbind(1)
     across = (u >= -radius) & (u <= camera.width + radius)
     return (z > camera.near) & across & (v >= -radius) & (v <= camera.height + radius)
 

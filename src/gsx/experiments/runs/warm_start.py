@@ -72,6 +72,7 @@ def training_data_digest(run: Run) -> str:
         camera = view.camera
         digest.update(camera.rotation.numpy().tobytes() + camera.translation.numpy().tobytes())
         digest.update(repr((view.name, camera.size, camera.fx, camera.fy, camera.cx, camera.cy)).encode())
+        digest.update(b"" if camera.lens is None else repr(camera.lens).encode())
         digest.update(repr("" if view.file is None else file_stamp(view.file)).encode())
     return digest.hexdigest()
 

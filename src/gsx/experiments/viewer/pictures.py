@@ -190,11 +190,21 @@ def placed(
     scale = camera.fy / taken_by.fy
     columns = (torch.arange(camera.width).to(photo) + 0.5 - camera.cx) * (taken_by.fx / camera.fx) + taken_by.cx
     rows = (torch.arange(camera.height).to(photo) + 0.5 - camera.cy) / scale + taken_by.cy
-    x, y = 2 * columns / taken_by.width - 1, 2 * rows / taken_by.height - 1
-    grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None]
+    places = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
+    if taken_by.lens is not None:
+        places = through_lens(places, taken_by)
+    grid = 2 * (places / places.new_tensor(taken_by.size)) - 1
     smaller = photo[None]
     if scale < 1:  # averaged first, so that it does not alias
         size = [max(1, round(side * scale)) for side in photo.shape[1:]]
         smaller = interpolate(smaller, size, mode="bicubic", antialias=True).clamp(0, 1)
     sampled = grid_sample(smaller, grid, padding_mode="border", align_corners=False)
-    return sampled[0], (x.abs() <= 1)[None] & (y.abs() <= 1)[:, None]
+    return sampled[0], (grid[0].abs() <= 1).all(-1)
+
+
+def through_lens(places: Float[Tensor, "H W 2"], camera: Camera) -> Float[Tensor, "H W 2"]:
+    """Moves places of a pinhole's picture, px, to where the camera's lens shows them; far outside: it does not."""
+    assert camera.lens is not None
+    focal, centre = places.new_tensor([camera.fx, camera.fy]), places.new_tensor([camera.cx, camera.cy])
+    rays = torch.nn.functional.pad((places - centre) / focal, (0, 1), value=1.0)
+    return (camera.lens.bend(rays.flatten(0, 1)).view_as(places) * focal + centre).nan_to_num(-1e9)

@@ -166,7 +166,7 @@ def window(solid: Solid, camera: Camera) -> tuple[slice, slice] | None:
     """Return the rows and columns of the raster outside which no ray can hit the solid; None: it is out of view."""
     pixels, depths = camera.project(solid.corners())
     whole = slice(0, camera.height), slice(0, camera.width)
-    if float(depths.min()) <= CLOSE:
+    if camera.lens is not None or float(depths.min()) <= CLOSE:  # a lens bends the box's edges outwards
         return whole
     (left, top), (right, bottom) = pixels.min(0).values.tolist(), pixels.max(0).values.tolist()
     rows = slice(max(0, math.floor(top) - 1), min(camera.height, math.ceil(bottom) + 1))

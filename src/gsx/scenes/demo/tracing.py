@@ -69,6 +69,9 @@ def lattice(count: int) -> Float[Tensor, "2 count"]:
 def rays_through(camera: Camera, u: Float[Tensor, "*#rays"], v: Float[Tensor, "*#rays"]) -> Rays:
     """Return rays through raster positions (u, v) in pixels, float64."""
     x, y = slopes(u, camera.cx, camera.fx), slopes(v, camera.cy, camera.fy)
+    if camera.lens is not None:
+        bent = torch.stack(torch.broadcast_tensors(x, y), -1)
+        x, y = camera.lens.straighten(bent.flatten(0, -2)).view(bent.shape).unbind(-1)
     directions = torch.stack([axis[0] * x + axis[1] * y + axis[2] for axis in camera.rotation.T.tolist()])
     return Rays(camera.centre.double(), normalise(directions))
 

@@ -20,6 +20,7 @@ from gsx.core.shapes import Float, UInt8
 from gsx.engine.cache import cache_folder, content_key
 from gsx.engine.cached_images import cache_image, read_cached_image
 from gsx.scenes.demo.cameras import DISTANCES, Cameras, even_cameras, mixed_cameras, spiral_camera
+from gsx.scenes.demo.fisheye import straightened, through_fisheye
 from gsx.scenes.demo.passer_by import with_passer_by
 from gsx.scenes.demo.still_life import StillLife, make_still_life
 from gsx.scenes.demo.tracing import colours_of, depth_of, points_at, render
@@ -50,6 +51,8 @@ class RayCastOptions(SceneOptions):
     """Seed of the initial points."""
     passer_by: bool = False
     """A person stands before each training camera. The default: runs older than this option."""
+    fisheye: Annotated[float, Range(0, 170)] = 0.0
+    """Horizontal angle of view of a fisheye for all cameras, degrees; 0: pinholes. `lens` decides its use."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,13 +107,15 @@ def same_view(camera: Camera, own: Camera) -> bool:
     """Return whether `camera` is `own` at some resolution, and no crop of it."""
     back = camera.resize(*own.size)
     intrinsics = ((back.fx, own.fx), (back.fy, own.fy), (back.cx, own.cx), (back.cy, own.cy))
-    return camera.has_pose_of(own) and all(abs(a - b) < SAME for a, b in intrinsics)
+    same = camera.has_pose_of(own) and camera.lens == own.lens
+    return same and all(abs(a - b) < SAME for a, b in intrinsics)
 
 
 def camera_key(camera: Camera) -> str:
     """Digest everything that a picture depends on."""
     pose = camera.rotation.tolist(), camera.translation.tolist()
-    return content_key(*pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+    lens = [] if camera.lens is None else [repr(camera.lens)]
+    return content_key(*pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, *lens)
 
 
 def sample_points(life: StillLife, cameras: Sequence[Camera], count: int, generator: torch.Generator) -> PointCloud:
@@ -190,6 +195,8 @@ def scene_of(
     name, version: of the format and its cached pictures; floor: its height, scene units.
     """
     cache = ImageCache(int(options.cache_gb * 1e9))
+    if options.fisheye:
+        cameras = through_fisheye(cameras, options.fisheye)
 
     def source(view: str, camera: Camera, somebody: bool) -> DemoSource:
         things = with_passer_by(life, camera, view, floor) if somebody else life
@@ -200,11 +207,14 @@ def scene_of(
     train_views = make_views("train", cameras.train, partial(source, somebody=options.passer_by))
     test_views = make_views("test", cameras.test, partial(source, somebody=False))
     train, every = [view.camera for view in train_views], options.split == "none"
+    made_of = points(life, train, options.points, torch.Generator().manual_seed(options.seed))
+    if options.fisheye and options.lens == "undistort":
+        train_views, test_views = (straightened(views, cache) for views in (train_views, test_views))
     return Scene(
         name=options.name,
         train=[*train_views, *test_views] if every else train_views,
         test=[] if every else test_views,
-        points=points(life, train, options.points, torch.Generator().manual_seed(options.seed)),
+        points=made_of,
         background=torch.tensor(options.background),
         extent=extent_of(train),
         notes=["somebody stands before each training camera (scene.passer_by)"] if options.passer_by else [],
@@ -215,11 +225,16 @@ def scene_of(
 def provenance(options: RayCastOptions, name: str, version: str, split: str) -> dict[str, Any]:
     """Return everything that decides the pictures, for the evaluation protocol; `split`: of its cameras."""
     somebody = {"passer_by": True} if options.passer_by else {}
-    return somebody | {
-        "format": name,
-        "version": version,
-        "size": list(size_of(options)),
-        "samples": options.samples,
-        "light": "display",
-        "split": split + (", all trained on" if options.split == "none" else ""),
-    }
+    lens = {"fisheye": options.fisheye, "lens": options.lens} if options.fisheye else {}
+    return (
+        somebody
+        | lens
+        | {
+            "format": name,
+            "version": version,
+            "size": list(size_of(options)),
+            "samples": options.samples,
+            "light": "display",
+            "split": split + (", all trained on" if options.split == "none" else ""),
+        }
+    )
