@@ -110,6 +110,13 @@ def test_anchors_cost_several_primitives() -> None:
     assert rows.primitives < free.primitives
 
 
+def test_a_plan_removes_no_anchors() -> None:
+    """Where 19,000 primitives suit the pixels of 40 views, Gaussians shrink to them."""
+    task = task_of(600.0, "scene.downscale", primitives=40_000)
+    assert plan_run(task).primitives == round(0.1 * 30_000 * 40**0.5)
+    assert plan_run(replace(task, settings=composed("backbone=octree_scaffold"))).primitives == 40_000
+
+
 def test_short_runs_have_events_within_a_pass_over_the_views() -> None:
     """Growth from 500 to 15,000 of 30,000 steps: 0.4833 of the steps for 8 events."""
     task = task_of(0.0)

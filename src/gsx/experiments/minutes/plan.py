@@ -197,6 +197,8 @@ def growth_of(task: Task, downscale: int, steps: int) -> Growth:
     target = target_of(task, downscale)
     first += stereo_points(task, target)
     last = min(target, first + options.most_growth * steps / 1000)
+    if rows_of(task) > 1:  # anchors of coarse levels show much: a model that lost some drew nothing (castle)
+        last = max(last, first)
     if values.get(CAPACITY) == "budget" and CAPACITY in task.fixed:
         last = values[BUDGET]
     last = min(last, values.get(MOST) or last)
