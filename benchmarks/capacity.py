@@ -4,13 +4,13 @@
 
 FOLDER holds `fox` (COLMAP), `lego` (NeRF-Synthetic), `castle` (photographs alone); without it only the built-in scene
 is measured. `growth`: every scene is trained as published, adaptively, and with a budget of as many primitives as
-published ends with, and of fewer, beside published growth held at that cap; the same steps. `compact`: the published
-runs made smaller by `gsx compact`. `bands`: adaptive runs in which each Gaussian keeps the SH bands worth their
-numbers, beside adaptive runs that keep all. `evidence`: what share of adaptive runs goes into judging. `cooldown`:
-published runs in which learning rates go down to nothing at the end, beside published ones. `plateau`: longer runs that
-leave out steps which gain too little, beside such that take them all. `cells`: levels of detail whose coarsest cells
-are pixels, grown as published and adaptively, beside published ones. `flat`: adaptive runs of photographs of one
-colour alone, made here. Finished runs below --runs are not trained again.
+published ends with, and of fewer, beside published growth held at that cap and MCMC; the same steps. `compact`:
+the published runs made smaller by `gsx compact`. `bands`: adaptive runs in which each Gaussian keeps the SH bands worth
+their numbers, beside adaptive runs that keep all. `evidence`: what share of adaptive runs goes into judging.
+`cooldown`: published runs in which learning rates go down to nothing at the end, beside published ones. `plateau`:
+longer runs that leave out steps which gain too little, beside such that take them all. `cells`: levels of detail whose
+coarsest cells are pixels, grown as published and adaptively, beside published ones. `flat`: adaptive runs of
+photographs of one colour alone, made here. Finished runs below --runs are not trained again.
 A quarter of an hour of two cores for a scene, a backbone and a seed.
 """
 
@@ -51,7 +51,10 @@ SUBJECTS = {
 BUILT_IN = ("demo", "room")
 FEWER = {"fox": 25000, "fox_4": 40000, "lego": 5000, "castle": 40000, "demo": 20000, "room": 10000}
 """Primitives of the smaller budget."""
-ARMS = ("published", "adaptive", "budget as published", "budget of fewer", "published, held at fewer")
+ARMS = (
+    *("published", "adaptive", "budget as published", "budget of fewer", "published, held at fewer"),
+    *("mcmc as published", "mcmc of fewer"),
+)
 PUBLISHED, ADAPTIVE = "backbone.capacity=published", "backbone.capacity=adaptive"
 ZOOMS = ("1", "2", "4")
 
@@ -74,12 +77,13 @@ def arguments(words: Sequence[str]) -> argparse.Namespace:
 
 def overrides_of(arm: str, scene: str, published: dict[str, Any]) -> list[str]:
     """What makes an arm; `published`: evaluation of the published arm with the same seed."""
-    number = published["primitives"] if arm == "budget as published" else FEWER[scene]
+    number = published["primitives"] if arm.endswith("as published") else FEWER[scene]
+    capacity = arm.split()[0]
     return {
         "published": [PUBLISHED],
         "adaptive": [ADAPTIVE],
         "published, held at fewer": [PUBLISHED, f"backbone.max_primitives={number}"],
-    }.get(arm, ["backbone.capacity=budget", f"backbone.budget.primitives={number}"])
+    }.get(arm, [f"backbone.capacity={capacity}", f"backbone.{capacity}.primitives={number}"])
 
 
 def folder_of(arm: str, scene: str, backbone: str, seed: int, given: argparse.Namespace) -> Path:
@@ -134,7 +138,7 @@ COLUMNS = [
 ]
 NOTE = (
     "PSNR on held-out views, dB, means over seeds ± half their range; differences and shares seed by seed, times are "
-    "medians. The same steps. Budget of fewer: {fewer}."
+    "medians. The same steps. Fewer: {fewer}."
 )
 
 

@@ -79,7 +79,7 @@ def test_a_budget_is_met(points: int, primitives: int, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (("backbone.capacity=most",), "backbone.capacity is 'most'; choose published, budget or adaptive"),
+        (("backbone.capacity=most",), "backbone.capacity is 'most'; choose published, budget, adaptive, mcmc"),
         (("backbone.capacity=budget",), "capacity=budget and a number above 0"),
         (("backbone.budget.primitives=9",), "capacity=budget and a number above 0"),
         (("backbone.capacity=budget", "backbone.budget.primitives=6000000"), "above backbone.max_primitives"),

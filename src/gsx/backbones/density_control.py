@@ -32,6 +32,10 @@ class DensityControl:
 
     resets = False
     """True: opacities are reset at intervals."""
+    after_adam = False
+    """True: an event follows the Adam step of its step."""
+    initial_scale = 1.0
+    """Initial scales over the distances of neighbouring points."""
     volume_weight = 0.0
     """Weight of the mean volume of the drawn Gaussians in the loss."""
 
@@ -42,6 +46,7 @@ class DensityControl:
         steps = self.options.start, self.options.stop, self.options.every
         self.events = event_steps(self.schedule, *steps, self.options.passes)
         self.capacity = capacity_of(options, context, self.events)
+        self.observed_until, self.initial_opacity = self.events.stop, options.initial_opacity
         self.reset_every = self.schedule.interval(self.options.reset_every, self.options.reset_passes)
         white = bool((context.scene.background == 1).all())
         self.white_reset = max(1, self.schedule.step(self.options.white_reset)) if white else 0
@@ -56,6 +61,15 @@ class DensityControl:
     def before_last_event(self, table: ParameterTable) -> ParameterTable | None:
         """Returns the table without the additions of the last event, for adaptive capacity; None: there were none."""
         return None
+
+    # -- outside of events ---------------------------------------------------------------------------------------
+
+    def regulariser(self, table: ParameterTable) -> Float[Tensor, ""] | None:
+        """Returns a loss term of all Gaussians; None: there is none."""
+        return None
+
+    def perturb(self, table: ParameterTable) -> None:
+        """Changes Gaussians after each Adam step."""
 
     # -- events --------------------------------------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ from gsx.backbones.density import add_statistics, densification_statistics, grad
 from gsx.backbones.density_control import CloneSplit, DensityControl
 from gsx.backbones.gs3d_options import GS3DOptions
 from gsx.backbones.long_axis import LongAxis
+from gsx.backbones.mcmc import MCMC
 from gsx.backbones.mip import absorb, filter_named
 from gsx.backbones.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.backbones.scene_model import SceneModel
@@ -27,8 +28,8 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.sh import colours_of, constant_from_colour, degree_of
 from gsx.core.gaussians.splats import Gaussians, Splats
 from gsx.core.rasterizer import Rendering
-from gsx.core.shapes import Int
-from gsx.core.training.backbone import BackboneContext, DrawnSplats, Observation
+from gsx.core.shapes import Float, Int
+from gsx.core.training.backbone import BackboneContext, Drawn, DrawnSplats, Observation
 from gsx.core.training.importance import Probe, random_views
 from gsx.core.training.parameter_table import ParameterTable
 from gsx.core.training.schedule import log_linear
@@ -36,8 +37,11 @@ from gsx.formats.smoothing import logit_of_log, unsmoothed
 from gsx.formats.splat_files import columns_of
 
 
-def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> dict[str, Tensor]:
-    """Returns raw parameters of one Gaussian per point (3D-GS, create_from_pcd and simple-knn)."""
+def initial_parameters(points: PointCloud, sh_degree: int, opacity: float, scale: float = 1.0) -> dict[str, Tensor]:
+    """Returns raw parameters of one Gaussian per point (3D-GS, create_from_pcd and simple-knn).
+
+    scale: sizes over the distances of neighbours.
+    """
     positions, count = points.positions.float(), len(points)
     distance = mean_square_distance(positions).clamp_min(LEAST_SQUARE_DISTANCE)
     return {
@@ -45,7 +49,7 @@ def initial_parameters(points: PointCloud, sh_degree: int, opacity: float) -> di
         "sh_dc": constant_from_colour(points.colours.float() / 255)[:, None],
         "sh_rest": torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
         "opacity_logits": torch.full((count,), math.log(opacity / (1 - opacity))),
-        "log_scales": distance.sqrt().log()[:, None].repeat(1, 3),
+        "log_scales": (scale * distance.sqrt()).log()[:, None].repeat(1, 3),
         "quats": torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
     }
 
@@ -78,8 +82,8 @@ def choose_sh_degrees(model: "GS3D", step: int) -> dict[str, float]:
 
 def gs3d(options: GS3DOptions, context: BackboneContext) -> "GS3D":
     """Builds the backbones gs3d, gs3d_zoom and mip_splatting."""
-    control = (CloneSplit if options.capacity == "published" else LongAxis)(options, context)
-    return GS3D(options, context, Visibility(), control)
+    controls = {"published": CloneSplit, "mcmc": MCMC}
+    return GS3D(options, context, Visibility(), controls.get(options.capacity, LongAxis)(options, context))
 
 
 class GS3D(SceneModel):
@@ -100,7 +104,8 @@ class GS3D(SceneModel):
     def initial_table(self, points: PointCloud) -> ParameterTable:
         """Builds a Gaussian for each initial point, and for each point of the sky."""
         points, columns = self.visibility.start(points)
-        raw = initial_parameters(points, self.options.sh_degree, self.options.initial_opacity)
+        control = self.control
+        raw = initial_parameters(points, self.options.sh_degree, control.initial_opacity, control.initial_scale)
         if self.options.sky != "never":
             sky = sky_behind(self.context.scene, self.options.sky) if self.context.begins else NOTHING
             behind = initial_parameters(sky.points, self.options.sh_degree, SKY_OPACITY)
@@ -156,8 +161,8 @@ class GS3D(SceneModel):
         return DrawnSplats(splats=splats, rows=visible.rows)
 
     def observe(self, drawn: DrawnSplats, rendering: Rendering, step: int, weight: float = 1.0) -> Observation:
-        """Returns screen gradients until density control ends (3D-GS, train.py)."""
-        if step >= self.control.events.stop:
+        """Returns screen gradients until density control needs no more (3D-GS, train.py)."""
+        if step >= self.control.observed_until:
             return {}
         return densification_statistics(rendering.screen, drawn.rows, weight)
 
@@ -169,7 +174,10 @@ class GS3D(SceneModel):
     def densify_and_prune(self, step: int) -> dict[str, float]:
         """Removes rows in empty space once; clones, splits, prunes and resets when due."""
         metrics = self.capacity.remove_empty(self.table, self.table["means"]) if step == 1 else {}
-        metrics |= self.control.densify(self, step) if self.control.events.due(step) else {}
+        due = self.control.events.due(step)
+        if due and self.control.after_adam:
+            self.learn(step)
+        metrics |= self.control.densify(self, step) if due else {}
         if metrics or self.filter.due(step):
             before = self.table.columns.get("filter")
             self.filter.refresh(self.table, self.table["means"], step)
@@ -207,8 +215,18 @@ class GS3D(SceneModel):
         """Returns the SH bands above 0: unused ones take part (3D-GS), edited parameters wait for a gradient."""
         return [self.table.parameters["sh_rest"]]
 
+    def regulariser(self, drawn: Drawn) -> Float[Tensor, ""] | None:
+        """Returns the loss term of density control; without one that of the drawn volume."""
+        term = self.control.regulariser(self.table)
+        return super().regulariser(drawn) if term is None else term
+
     def update(self, step: int) -> None:
-        """Takes one Adam step; bands above the chosen degrees stay 0."""
+        """Takes one Adam step, unless an event has taken it, and lets density control move Gaussians."""
+        self.learn(step)
+        self.control.perturb(self.table)
+
+    def learn(self, step: int) -> None:
+        """Takes one Adam step by the gradients that there are; bands above the chosen degrees stay 0."""
         if "sh_degree" in self.table.columns and step >= self.sh_step():
             hold_bands(self.table)
         super().update(step)

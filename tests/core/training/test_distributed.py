@@ -186,6 +186,17 @@ def test_two_processes_judge_as_one(forking: Any, tmp_path: Path) -> None:
     assert_same(tmp_path / "two", tmp_path / "one")
 
 
+def test_two_processes_relocate_as_one(forking: Any, tmp_path: Path) -> None:
+    """Both draw the same donors and the same noise."""
+    chain = ("backbone.capacity=mcmc", "backbone.mcmc.primitives=400", "backbone.mcmc.dead_opacity=0.4")
+    words = (*OVERRIDES, *COMMON, *chain, "iterations=8")
+    two = both(forking, tmp_path / "said", *words, f"folder={tmp_path / 'two'}")
+    assert two.returncode == 0, two.stderr
+    alone(*words, f"folder={tmp_path / 'one'}")
+    assert any(line.get("relocated") for line in lines(tmp_path / "one")), "the test needs relocation"
+    assert_same(tmp_path / "two", tmp_path / "one")
+
+
 def test_two_processes_with_networks_and_pseudo_views_equal_one(forking: Any, tmp_path: Path) -> None:
     """Growth across levels, and pseudo views that the first process makes for both."""
     two = both(forking, tmp_path / "said", *OVERRIDES, *OCTREE, f"folder={tmp_path / 'two'}")

@@ -62,8 +62,8 @@ def train_step(run: Run, plugins: Plugins) -> StepResult:
     else:
         for observation in result.observations:
             run.backbone.accumulate(observation)
-        result.changes.update(run.backbone.densify_and_prune(step))
         run.backbone.table.pace = run.training.pace(step, run.iterations)
+        result.changes.update(run.backbone.densify_and_prune(step))
         run.backbone.update(step)
         for module in run.modules.values():
             module.optimizer_step(step)

@@ -45,8 +45,9 @@ UNCHANGED = {
     "backbone.clone_split.density.passes": 1.0,
 }
 """Keys newer than the first digests, with their neutral values, which do not count."""
-WITHOUT_EFFECT = {
+WITHOUT_EFFECT: dict[str, dict[str, Any]] = {
     "training.deadline": {"seconds": 0.0, "steps": 0, "planned": [], "start": 0.5, "to": 0.8, "skip": []},
+    "backbone.mcmc": {"primitives": 0},
 }
 """Nodes newer than the first digests, with values by which they change nothing and do not count."""
 TRIAL = "training.trial"
