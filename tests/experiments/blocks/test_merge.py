@@ -9,6 +9,7 @@ from tiny import words
 
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
+from gsx.experiments.blocks.merge import Trained, ordered, refuse_different, settings_of
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.formats.splat_files import read_splats
@@ -38,6 +39,15 @@ def test_a_file_has_the_splats_of_each_cell(blocks: Path, tmp_path: Path, capsys
     assert report.is_file()
     assert "4 test views" in (report.parent / "log.txt").read_text()
     shutil.rmtree(report.parent)
+
+
+def test_a_run_older_than_a_setting_is_merged(blocks: Path, tmp_path: Path) -> None:
+    older = Path(shutil.copytree(blocks / "1", tmp_path / "older"))
+    config = older / "config.yaml"
+    lines = [line for line in config.read_text().splitlines() if not line.strip().startswith("stereo:")]
+    config.write_text("\n".join(lines))
+    runs = [Trained(folder=folder, settings=settings_of(folder, plugins())) for folder in (older, blocks / "2")]
+    refuse_different(ordered(runs))
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

@@ -14,6 +14,7 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.options import flattened
 from gsx.core.plugins import Plugins
+from gsx.experiments.run_folder.run_key import UNCHANGED
 from gsx.experiments.runs.bake import bake
 from gsx.experiments.runs.export import explicit_of, refuse_export, write_model
 from gsx.experiments.runs.load_scene import load_scene
@@ -99,8 +100,11 @@ def refuse_different(blocks: Sequence[Trained]) -> None:
 
 
 def drawn_alike(settings: Settings) -> dict[str, Any]:
-    """Returns the settings that merged runs have in common: scene, type of model, and rules of the rasterizer."""
-    values = flattened(settings.resolved)
+    """Returns the settings that merged runs have in common: scene, type of model, and rules of the rasterizer.
+
+    Settings that older runs lack do not count with the values by which they change nothing.
+    """
+    values = {key: value for key, value in flattened(settings.resolved).items() if UNCHANGED.get(key, ...) != value}
     rules = ("rasterizer.dilation", "rasterizer.compensate", "backbone.name", "backbone.filter")
     scene = {key: value for key, value in values.items() if key.startswith("scene.") and key not in FREE}
     return scene | {key: values[key] for key in rules if key in values}
