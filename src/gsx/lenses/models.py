@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,13 +31,6 @@ SAME = 1e-9
 """Largest residual of an inverted distortion, relative to the focal length."""
 NONE4, NONE3, NONE2 = (0.0,) * 4, (0.0,) * 3, (0.0,) * 2
 IDENTITY = (1.0, 0.0, 0.0, 1.0)
-
-
-class Radial(NamedTuple):
-    """Factor of the radius and its derivative by the squared radius."""
-
-    factor: Tensor
-    slope: Tensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,24 +92,33 @@ class Distortion(Unscented):
         factor = torch.where(near, 1 - squares / 3 + squares.square() / 5, slopes.atan() / slopes)
         return across * factor[:, None], valid
 
-    def _radial(self, squares: Float[Tensor, "P"]) -> Radial:
-        above, below = polynomial(self.radial, squares), polynomial(self.divisor, squares)
-        factor = above.factor / below.factor
-        return Radial(factor, (above.slope - factor * below.slope) / below.factor)
+    def _factor(self, squares: Float[Tensor, "P"]) -> Float[Tensor, "P"]:
+        """Return the factor of the radius."""
+        above = polynomial((1.0, *self.radial), squares)
+        return above / polynomial((1.0, *self.divisor), squares) if any(self.divisor) else above
+
+    def _factor_slope(self, squares: Float[Tensor, "P"]) -> Float[Tensor, "P"]:
+        """Return the derivative of the factor by the squared radius."""
+        above, below = (derivative((1.0, *coefficients)) for coefficients in (self.radial, self.divisor))
+        change = polynomial(above, squares) - self._factor(squares) * polynomial(below, squares)
+        return change / polynomial((1.0, *self.divisor), squares)
 
     def _distorted(self, plane: Float[Tensor, "P 2"]) -> Float[Tensor, "P 2"]:
         x, y = plane.unbind(1)
         (p1, p2), (s1, s2), squares = self.tangential, self.prism, x * x + y * y
-        factor = self._radial(squares).factor
-        across = x * factor + 2 * p1 * x * y + p2 * (squares + 2 * x * x) + s1 * squares
-        down = y * factor + 2 * p2 * x * y + p1 * (squares + 2 * y * y) + s2 * squares
+        across, down = plane.T * self._factor(squares)
+        if any((p1, p2)):
+            across = across + 2 * p1 * x * y + p2 * (squares + 2 * x * x)
+            down = down + 2 * p2 * x * y + p1 * (squares + 2 * y * y)
+        if any((s1, s2)):
+            across, down = across + s1 * squares, down + s2 * squares
         return torch.stack([across, down], 1)
 
     def _jacobian(self, plane: Float[Tensor, "P 2"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the derivatives of `_distorted` by row: (ax, ay, dx, dy)."""
         x, y = plane.unbind(1)
         (p1, p2), (s1, s2) = self.tangential, self.prism
-        factor, slope = self._radial(x * x + y * y)
+        factor, slope = self._factor(x * x + y * y), self._factor_slope(x * x + y * y)
         both = 2 * x * y * slope + 2 * (p1 * x + p2 * y)
         return (
             factor + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x + 2 * s1 * x,
@@ -129,7 +131,7 @@ class Distortion(Unscented):
         """Invert `_distorted` by Newton's method from the inverse of the radial part; NaN where it has none."""
         lengths, last = places.norm(dim=1), min(self.limit, math.tan(LARGEST_ANGLE))
         radii = torch.linspace(0, last, ANGLES, dtype=torch.float64, device=places.device)
-        table = radii * self._radial(radii.square()).factor
+        table = radii * self._factor(radii.square())
         nearest = torch.searchsorted(table.cummax(0).values, lengths).clamp(max=ANGLES - 1)
         plane = places * (radii[nearest] / lengths.clamp_min(1e-30))[:, None]
         for _ in range(NEWTON_STEPS):
@@ -156,13 +158,18 @@ class Distortion(Unscented):
         return float(radii[int(grows.long().cumprod(0).sum()) - 1])
 
 
-def polynomial(coefficients: Sequence[float], squares: Float[Tensor, "P"]) -> Radial:
-    """Return 1 + c1 s + c2 s^2 + ..., and its derivative by s."""
-    value, slope = torch.zeros_like(squares), torch.zeros_like(squares)
-    for coefficient in (*reversed(coefficients), 1.0):
-        slope = slope * squares + value
+def polynomial(coefficients: Sequence[float], squares: Float[Tensor, "P"]) -> Float[Tensor, "P"]:
+    """Return c0 + c1 s + c2 s^2 + ..., without products of leading zeros."""
+    last = max((n for n, coefficient in enumerate(coefficients) if coefficient), default=0)
+    value = torch.full_like(squares, coefficients[last])
+    for coefficient in reversed(coefficients[:last]):
         value = value * squares + coefficient
-    return Radial(value, slope)
+    return value
+
+
+def derivative(coefficients: Sequence[float]) -> list[float]:
+    """Return the coefficients of a polynomial's derivative."""
+    return [n * coefficient for n, coefficient in enumerate(coefficients)][1:]
 
 
 NATIVE = (

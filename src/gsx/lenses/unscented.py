@@ -43,9 +43,11 @@ class Unscented:
         high: Float[Tensor, "2"],
     ) -> Bool[Tensor, "N"]:
         """Mark Gaussians whose sigma points the lens shows, with a mean within `OUTSIDE` of the frame."""
-        images = self.images(points, scales, quats, rotation)
         middle, half = (low + high) / 2, (high - low) / 2
-        return images.isfinite().all(2).all(0) & ((images[0] - middle).abs() <= OUTSIDE * half).all(1)
+        near = ((self.bend(points) - middle).abs() <= OUTSIDE * half).all(1)  # false for NaN
+        rows = near.nonzero()[:, 0]
+        images = self.images(points[rows], scales[rows], quats[rows], rotation)
+        return near.index_put((rows,), images.isfinite().all(2).all(0))
 
     def geometry(
         self,
