@@ -137,6 +137,14 @@ def test_a_cap_of_primitives_is_kept() -> None:
     assert changes_of(task, plan_run(task))["backbone.budget.primitives"] == 900
 
 
+@pytest.mark.parametrize("capacity", ["budget", "mcmc"])
+def test_a_number_of_primitives_that_is_chosen_stays(capacity: str) -> None:
+    words = (f"backbone.capacity={capacity}", f"backbone.{capacity}.primitives=700")
+    task = task_of(600.0, "backbone.capacity", words=words)
+    assert plan_run(task).primitives == 700
+    assert "backbone.budget.primitives" not in changes_of(task, plan_run(task))
+
+
 def test_augmenters_keep_their_finer_renders() -> None:
     task = task_of(600.0, words=("augmenter=[mipmap]",))
     assert "training.supersampling.start" not in changes_of(task, plan_run(task))

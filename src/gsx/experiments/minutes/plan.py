@@ -199,8 +199,8 @@ def growth_of(task: Task, downscale: int, steps: int) -> Growth:
     last = min(target, first + options.most_growth * steps / 1000)
     if rows_of(task) > 1:  # anchors of coarse levels show much: a model that lost some drew nothing (castle)
         last = max(last, first)
-    if values.get(CAPACITY) == "budget" and CAPACITY in task.fixed:
-        last = values[BUDGET]
+    if CAPACITY in task.fixed:
+        last = values.get(f"backbone.{values[CAPACITY]}.primitives", last)
     last = min(last, values.get(MOST) or last)
     start, stop = growth_window(task)
     events = events_of(task, steps)
