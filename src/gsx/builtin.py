@@ -95,12 +95,14 @@ def add_diffusion(registry: Registry) -> None:
 def add_trackers(registry: Registry) -> None:
     """Register listeners that report a run to other programs."""
     from gsx.trackers.mlflow import MLflow, MLflowOptions
+    from gsx.trackers.rerun import Rerun, RerunOptions
     from gsx.trackers.tensorboard import TensorBoard, TensorBoardOptions
     from gsx.trackers.wandb import WandB, WandBOptions
 
     registry.add("tracker", "tensorboard", TensorBoard, TensorBoardOptions)
     registry.add("tracker", "mlflow", MLflow, MLflowOptions)
     registry.add("tracker", "wandb", WandB, WandBOptions)
+    registry.add("tracker", "rerun", Rerun, RerunOptions)
 
 
 def add_compositors(registry: Registry) -> None:

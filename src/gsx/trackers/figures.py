@@ -51,7 +51,8 @@ def zoom_table(evaluation: dict[str, Any]) -> list[dict[str, str]]:
 
 def zoom_row(factor: str, figures: dict[str, float]) -> dict[str, str]:
     """Formats the figures of a zoom; `gain` is the PSNR over that of the enlarged x1 render, dB."""
-    gain = {"gain": figures["psnr"] - figures["enlarged_psnr"]} if "enlarged_psnr" in figures else {}
+    compared = factor != "1" and "enlarged_psnr" in figures
+    gain = {"gain": figures["psnr"] - figures["enlarged_psnr"]} if compared else {}
     return {"zoom": f"x{factor}"} | {name: f"{value:.4g}" for name, value in (gain | figures).items()}
 
 

@@ -33,7 +33,7 @@ from gsx.experiments.runs.warm_start import warm_start_folder
 from gsx.trackers.figures import evaluation_figures, html, line_figures, markdown, zoom_table
 
 ROOT = Path(__file__).parents[3]
-NAMES = ",".join(name for name in ("tensorboard", "mlflow", "wandb") if find_spec(name))
+NAMES = ",".join(name for name in ("tensorboard", "mlflow", "wandb", "rerun") if find_spec(name))
 ALL = (f"tracker=[{NAMES}]", "tracker.mlflow.seconds=0")
 FEW = ("scene.points=100", "scene.train_views=3")
 DENSE = (*FEW, "iterations=12", "backbone.density.every=400", "backbone.density.reset_passes=1",
@@ -246,7 +246,7 @@ def test_a_run_with_trackers_ends_in_the_same_bits(tmp_path: Path, tracked: Trac
     assert all(torch.equal(without[name], with_trackers[name]) for name in without)
     assert (folder / "mlflow.db").is_file()
     assert (folder / "run" / "tensorboard").is_dir()
-    assert (folder / "run" / "wandb").is_dir() == ("wandb" in NAMES)
+    assert all((folder / "run" / name).is_dir() == (name in NAMES) for name in ("wandb", "rerun"))
 
 
 def test_runs_with_and_without_trackers_are_one_composition(tmp_path: Path) -> None:
@@ -291,7 +291,13 @@ def test_wrong_choices_are_refused(given: str, message: str, tmp_path: Path) -> 
 
 @pytest.mark.parametrize(
     ("tracker", "package"),
-    [("tensorboard", "tensorboard"), ("mlflow", "mlflow"), ("mlflow", "sqlalchemy"), ("wandb", "wandb")],
+    [
+        ("tensorboard", "tensorboard"),
+        ("mlflow", "mlflow"),
+        ("mlflow", "sqlalchemy"),
+        ("wandb", "wandb"),
+        ("rerun", "rerun"),
+    ],
 )
 def test_a_missing_package_is_refused_before_anything_is_done(
     tracker: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -317,7 +323,9 @@ def test_a_package_that_went_missing_is_refused_when_a_run_goes_on(
 
 def test_trackers_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plugins"]) == 0
-    assert re.search(r"tracker: +mlflow \(gsx\), tensorboard \(gsx\), wandb \(gsx\)", capsys.readouterr().out)
+    assert re.search(
+        r"tracker: +mlflow \(gsx\), rerun \(gsx\), tensorboard \(gsx\), wandb \(gsx\)", capsys.readouterr().out
+    )
 
 
 def test_numbers_are_named_as_in_the_files() -> None:
