@@ -15,7 +15,6 @@ from gsx.experiments.runs.typed import typed
 from gsx.lenses import Distortion
 from gsx.scenes import room
 from gsx.scenes.colmap import load
-from gsx.scenes.demo import RayCastOptions
 
 FISHEYE = (40.0, 41.0, 30.0, 25.0, 0.05, -0.02, 0.01, 0.0)
 
@@ -54,8 +53,8 @@ def test_a_lens_that_is_not_rendered_is_refused(tmp_path: Path) -> None:
 
 def room_through(**changes: Any) -> Scene:
     size = {"width": 48, "height": 36, "train_views": 4, "test_views": 1, "samples": 2, "fisheye": 120.0}
-    options = typed(RayCastOptions, shipped("room") | size | changes, "scene")
-    assert isinstance(options, RayCastOptions)
+    options = typed(room.RoomOptions, shipped("room") | size | changes, "scene")
+    assert isinstance(options, room.RoomOptions)
     return room.load(options)
 
 

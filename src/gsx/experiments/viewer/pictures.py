@@ -198,8 +198,8 @@ def placed(
     if scale < 1:  # averaged first, so that it does not alias
         size = [max(1, round(side * scale)) for side in photo.shape[1:]]
         smaller = interpolate(smaller, size, mode="bicubic", antialias=True).clamp(0, 1)
-    sampled = grid_sample(smaller, grid, padding_mode="border", align_corners=False)
-    return sampled[0], (grid[0].abs() <= 1).all(-1)
+    sampled = grid_sample(smaller, grid[None], padding_mode="border", align_corners=False)
+    return sampled[0], (grid.abs() <= 1).all(-1)
 
 
 def through_lens(places: Float[Tensor, "H W 2"], camera: Camera) -> Float[Tensor, "H W 2"]:
