@@ -193,7 +193,7 @@ def test_an_event_adds_a_twentieth_up_to_the_number(primitives: int, added: int)
 
 
 def test_the_sky_is_neither_moved_nor_copied_nor_weighed() -> None:
-    model = small([0.001, 0.5, 0.001, 0.5])
+    model = small([0.001, 0.02, 0.001, 0.999])  # the sky would be drawn first
     sky = torch.tensor([0, 0, 1, 1], dtype=torch.int8)
     model.table.columns["sky"] = sky
     before = model.table["means"].detach()[2:].clone()
