@@ -16,11 +16,13 @@ from pathlib import Path
 import torch
 
 from gsx.builtin import plugins
+from gsx.core.data.camera import centres_of
 from gsx.core.files import read_json
+from gsx.experiments.blocks.merge import merge_blocks
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.formats.splat_files import read_splats
-from gsx.scenes.blocks import centres_of, scene_cells
+from gsx.scenes.blocks import scene_cells
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import Section, stamped, text_table, write_results
 from measuring.runs import gsx, train
@@ -47,7 +49,7 @@ def views_near_cuts(count: int) -> set[str]:
     """Names of the test views whose cameras are near a cut."""
     scene = load_scene(compose(SCENE, plugins()))
     cuts = torch.stack([torch.stack([cell.low, cell.high]) for cell in scene_cells(scene, count)]).view(-1, 3)
-    apart = (centres_of(scene.test)[:, None] - cuts).abs().amin((1, 2))
+    apart = (centres_of([view.camera for view in scene.test])[:, None] - cuts).abs().amin((1, 2))
     return {view.name for view, distance in zip(scene.test, apart.tolist(), strict=True) if distance < NEAR}
 
 
@@ -69,19 +71,17 @@ def measure(seed: int, options: argparse.Namespace, near: set[str]) -> list[Row]
     """Trains the scene in one piece and in blocks."""
     count, base = options.count, options.runs / f"{seed}_{options.steps}"
     whole = train(base / "whole", words_for(seed, options.steps * count, WHOLE))
-    seconds = [
-        train(base / f"block_{number}", [*words_for(seed, options.steps, WHOLE // 2), f"scene.block={number}/{count}"])[
-            "train_seconds"
-        ]
-        for number in range(1, count + 1)
-    ]
+    own, blocks = words_for(seed, options.steps, WHOLE // 2), [f"{number}/{count}" for number in range(1, count + 1)]
+    folders = [base / f"block_{number}" for number in range(1, count + 1)]
+    trained = [train(folder, [*own, f"scene.block={block}"]) for folder, block in zip(folders, blocks, strict=True)]
+    seconds = sum(one["train_seconds"] for one in trained)
     merged, file = base / "merged", base / "merged.ply"
     if not (merged / "evaluation.json").is_file():
-        gsx(["merge", *(str(base / f"block_{number}") for number in range(1, count + 1)), "--to", str(file)])
+        merge_blocks(folders, file, plugins())
         gsx(["eval", str(file), *SCENE, "eval.zoom=[1,2,4]", f"folder={merged}"])
     rows = [
         {"model": "in one piece", "seconds": whole["train_seconds"]} | figures(base / "whole", near),
-        {"model": f"{count} blocks, merged", "seconds": sum(seconds)} | figures(merged, near),
+        {"model": f"{count} blocks, merged", "seconds": seconds} | figures(merged, near),
     ]
     assert rows[1]["primitives"] == len(read_splats(file).gaussians.means)
     return [{"seed": seed} | row for row in rows]

@@ -10,7 +10,7 @@ Messages go to the logger `gsx`; `gsx.show_messages()` shows them.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ from gsx.experiments.runs.export import export, refuse_export
 from gsx.experiments.runs.job import train as train_job
 from gsx.experiments.runs.logs import set_up_logging as show_messages
 from gsx.experiments.runs.open import open_run
-from gsx.experiments.runs.overrides import is_override, quoted
+from gsx.experiments.runs.overrides import is_override, plain, words_of
 from gsx.experiments.runs.render_views import view_named
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import rules_of
@@ -231,33 +231,3 @@ def load(
 def load_run(folder: Path) -> TrainedRun:
     """Open a run folder; errors as `load`."""
     return TrainedRun(*open_run(folder.resolve(), plugins()))
-
-
-def words_of(values: Mapping[str, Any], below: str = "") -> list[str]:
-    """Return values by name, nested ones too, as words of the command line."""
-    words = []
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            words += words_of(value, f"{below}{name}.")
-        else:
-            words.append(f"{below}{name}={text_of(plain(name, value))}")
-    return words
-
-
-def text_of(value: Any) -> str:
-    """Return a plain value in the syntax of the command line."""
-    if isinstance(value, list):
-        return f"[{','.join(map(text_of, value))}]"
-    return quoted(value) if isinstance(value, str) else json.dumps(value)
-
-
-def plain(name: str, value: Any) -> Any:
-    """Return a value of JSON: convert numbers of numpy and torch, and paths; raise ConfigError for other types."""
-    if isinstance(value, list | tuple):
-        return [plain(name, inner) for inner in value]
-    if isinstance(value, Path):
-        return str(value)
-    value = value.tolist() if hasattr(value, "tolist") else value
-    if not (value is None or isinstance(value, bool | int | float | str | list)):
-        raise ConfigError(f"{name} is a {type(value).__name__}; give a number, a text, a list of them, or null")
-    return value

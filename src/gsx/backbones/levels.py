@@ -15,7 +15,7 @@ from torch import Tensor
 from gsx.backbones.cells import new_cells
 from gsx.backbones.density import quantile
 from gsx.backbones.level_options import LevelOptions
-from gsx.core.data.camera import Camera, offsets_from
+from gsx.core.data.camera import Camera, centres_of, offsets_from
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.schedule import Schedule
 
@@ -53,7 +53,7 @@ def viewpoints_of(cameras: Sequence[Camera]) -> Viewpoints:
     """Returns positions and coarseness of the training cameras."""
     focal = max(camera.fx for camera in cameras)
     return Viewpoints(
-        centres=torch.stack([camera.centre.double() for camera in cameras]),
+        centres=centres_of(cameras),
         coarseness=torch.tensor([focal / camera.fx for camera in cameras]),
         focal=focal,
     )

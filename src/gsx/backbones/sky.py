@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera, offsets_from
+from gsx.core.data.camera import Camera, centres_of, offsets_from
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import ParameterTable
@@ -176,7 +176,7 @@ def rays_of(camera: Camera, pixels: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"
 
 def centre_of(views: Sequence[View]) -> Float[Tensor, "3"]:
     """Returns the mean camera centre, float64."""
-    return torch.stack([view.camera.centre.double() for view in views]).mean(0)
+    return centres_of([view.camera for view in views]).mean(0)
 
 
 def radius_of(scene: Scene) -> float:

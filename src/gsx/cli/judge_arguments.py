@@ -13,7 +13,6 @@ SETTINGS = (
     *("rasterizer", "regenerator"),
 )
 """Settings of scene and figures; other words NAME=PATH are methods."""
-FOLDER = "conf/protocol"
 SCENE = ("scene=", "dataset=")
 """Settings that choose a scene."""
 
@@ -52,7 +51,9 @@ def names(word: str) -> list[str]:
     """Split names at commas; a name that is repeated counts once. ConfigError: there is none."""
     found = list(dict.fromkeys(name.strip() for name in word.split(",") if name.strip()))
     if not found:
-        raise ConfigError(f"gsx judge: --protocols '{word}' names no protocol: leave it out, or name those of {FOLDER}")
+        raise ConfigError(
+            f"gsx judge: --protocols '{word}' names no protocol: leave it out, or name those of conf/protocol"
+        )
     return found
 
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, max_pool2d
 
-from gsx.core.data.camera import Camera
+from gsx.core.data.camera import Camera, centres_of
 from gsx.core.shapes import Bool, Float, Int
 
 Blocks: TypeAlias = Bool[Tensor, "h w"]
@@ -128,7 +128,7 @@ def distractors_in(differences: Sequence[Difference]) -> list[Blocks]:
         return [torch.zeros_like(one.counted) for one in differences]
     counted = torch.cat([one.size[one.counted] for one in differences])
     least = max(LEAST, TIMES * float(counted.median())) if len(counted) else LEAST
-    centres = torch.stack([one.camera.centre.double() for one in differences])
+    centres = centres_of([one.camera for one in differences])
     found = []
     for number, own in enumerate(differences):
         order = (centres - centres[number]).norm(dim=1).argsort(stable=True)

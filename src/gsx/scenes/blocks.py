@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gsx.core.data.camera import centres_of
 from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.errors import ConfigError
 from gsx.core.shapes import Bool, Float, Int
@@ -44,7 +45,7 @@ class BlockChoice:
     """Block to train on."""
 
     number: int
-    """From 1."""
+    """Number of the block, from 1."""
     count: int
     margin: float
     """Width of the zone around the cell whose cameras are used, as a share of the box of the cell's own cameras."""
@@ -92,14 +93,9 @@ def halved(centres: Float[Tensor, "N 3"], cell: Cell, count: int) -> list[Cell]:
     return [*halved(centres, left, count // 2), *halved(centres, right, count - count // 2)]
 
 
-def centres_of(views: Sequence[View]) -> Float[Tensor, "N 3"]:
-    """Returns the camera centres of views, float64."""
-    return torch.stack([view.camera.centre.double() for view in views])
-
-
 def scene_cells(scene: Scene, count: int) -> list[Cell]:
     """Returns the cells of a whole scene; ConfigError: see `cells_of`."""
-    return cells_of(centres_of(scene.train), count)
+    return cells_of(centres_of([view.camera for view in scene.train]), count)
 
 
 def block_of(scene: Scene, choice: BlockChoice) -> Scene:
@@ -130,7 +126,7 @@ def block_of(scene: Scene, choice: BlockChoice) -> Scene:
 
 def used_views(scene: Scene, cell: Cell, choice: BlockChoice) -> Bool[Tensor, "N"]:
     """Marks the training views of a block."""
-    centres = centres_of(scene.train)
+    centres = centres_of([view.camera for view in scene.train])
     own = centres[cell.cameras]
     near = cell.holds(centres, choice.margin * (own.amax(0) - own.amin(0)))
     step = 1 + len(scene.points) // MOST_POINTS
@@ -144,7 +140,7 @@ def tested_views(views: Sequence[View], cell: Cell) -> list[View]:
     """Returns the test views in a cell, or the one nearest to its cameras' side; empty: there are none."""
     if not views:
         return []
-    centres = centres_of(views)
+    centres = centres_of([view.camera for view in views])
     inside = cell.holds(centres)
     if not bool(inside.any()):
         outside = (cell.low - centres).clamp_min(0) + (centres - cell.high).clamp_min(0)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera
+from gsx.core.data.camera import Camera, centres_of
 from gsx.core.data.scene import Scene
 from gsx.core.shapes import Float
 from gsx.formats.origin import NO_ORIGIN, Origin, chosen_origin, in_words, rounding_at, stored_in_single
@@ -27,7 +27,7 @@ def origin_of(scene: Scene) -> Origin:
 
 def origin_of_cameras(cameras: Sequence[Camera], least: float = 0.0) -> Origin:
     """Return the origin for cameras: by their median centre, and their mean distance from it or the `least` scale."""
-    centres = torch.stack([camera.centre.double() for camera in cameras])
+    centres = centres_of(cameras)
     middle = centres.median(0).values
     return chosen_origin(middle, max(least, float((centres - middle).norm(dim=1).mean())))
 
@@ -78,7 +78,7 @@ def notes_on(scene: Scene, origin: Origin) -> list[str]:
 
 def focus_of(cameras: Sequence[Camera]) -> Float[Tensor, "3"]:
     """Return the point nearest to the optical axes of all cameras, float64."""
-    middle = torch.stack([camera.centre.double() for camera in cameras]).mean(0)
+    middle = centres_of(cameras).mean(0)
     system, right = torch.zeros(3, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     for camera in cameras:
         ahead = camera.rotation[2].double()

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, normalize, pad
 
-from gsx.core.data.camera import Camera
+from gsx.core.data.camera import Camera, centres_of
 from gsx.core.data.scene import PointCloud, Scene, View
 from gsx.core.shapes import Bool, Float, Int, UInt8
 
@@ -109,7 +109,7 @@ def reduced(view: View) -> Reduced:
 def neighbours(cameras: Sequence[Camera], positions: Float[Tensor, "P 3"]) -> list[list[int]]:
     """Returns for each camera those to compare it with: by common points, weighted by the angle of their rays."""
     visible = torch.stack([camera.shows(*camera.project(positions)) for camera in cameras])
-    centres = torch.stack([camera.centre.double() for camera in cameras])
+    centres = centres_of(cameras)
     rays = normalize(positions.double() - centres[:, None], dim=2)
     return [best_partners(index, rays, visible) for index in range(len(cameras))]
 

@@ -10,6 +10,11 @@ PictureCount: TypeAlias = Annotated[int, Range(0, 10**6)]
 """Number of test views whose render, truth and zoomed crops a tracker receives at an evaluation."""
 
 
+def kept_state(file: Path) -> dict[str, Any]:
+    """Reads what a tracker has noted in the run folder, such as its id of the run; empty: nothing yet."""
+    return read_json(file) if file.is_file() else {}
+
+
 def numbers(content: dict[str, Any], prefix: str = "") -> dict[str, float]:
     """Returns the numbers directly in a mapping, finite or not, with `prefix` before their key."""
     kept = {key: value for key, value in content.items() if isinstance(value, int | float)}

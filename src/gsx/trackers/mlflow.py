@@ -14,14 +14,14 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 from filelock import FileLock
 
 from gsx.core.errors import ConfigError, first_line
-from gsx.core.files import csv_text, read_json, write_json
+from gsx.core.files import csv_text, write_json
 from gsx.core.options import flattened
 from gsx.core.packages import require
 from gsx.core.plugins import hookimpl
 from gsx.core.ranges import Seconds
 from gsx.core.training.run import Run
 from gsx.engine.machine import device_name
-from gsx.trackers.figures import PictureCount, evaluation_figures, line_figures, pictures, zoom_table
+from gsx.trackers.figures import PictureCount, evaluation_figures, kept_state, line_figures, pictures, zoom_table
 
 logger = logging.getLogger(__name__)
 
@@ -100,7 +100,7 @@ class MLflow:
     @hookimpl
     def gsx_run_started(self, run: Run) -> None:
         """Creates MLflow's run, or resumes the one of this run folder."""
-        state = read_json(run.folder / STATE) if (run.folder / STATE).is_file() else {}
+        state = kept_state(run.folder / STATE)
         uri = self.options.uri or state.get("uri") or default_store(run)
         self.client = self.client or client_of(uri)
         if state.get("uri") == uri:

@@ -13,7 +13,7 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.errors import GsxError
-from gsx.core.files import read_json, write_json
+from gsx.core.files import write_json
 from gsx.core.gaussians.sh import colour_of_constant
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.packages import require
@@ -22,7 +22,15 @@ from gsx.core.ranges import Range
 from gsx.core.shapes import Float
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
-from gsx.trackers.figures import PictureCount, evaluation_figures, line_figures, markdown, pictures, zoom_table
+from gsx.trackers.figures import (
+    PictureCount,
+    evaluation_figures,
+    kept_state,
+    line_figures,
+    markdown,
+    pictures,
+    zoom_table,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -63,7 +71,7 @@ class Rerun:
         """Opens a new file of this run's recording, with points and configuration."""
         import rerun
 
-        state = read_json(run.folder / STATE) if (run.folder / STATE).is_file() else {}
+        state = kept_state(run.folder / STATE)
         self.recording, self.sent = state.get("recording", str(uuid.uuid4())), state.get("step", -1)
         folder = run.folder / FOLDER
         folder.mkdir(exist_ok=True)

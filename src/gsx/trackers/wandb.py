@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from gsx.core.errors import ConfigError
-from gsx.core.files import read_json, write_json
+from gsx.core.files import write_json
 from gsx.core.packages import require
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run
-from gsx.trackers.figures import PictureCount, evaluation_figures, html, line_figures, pictures, zoom_table
+from gsx.trackers.figures import PictureCount, evaluation_figures, html, kept_state, line_figures, pictures, zoom_table
 
 logger = logging.getLogger(__name__)
 
@@ -65,7 +65,7 @@ class WandB:
         """
         import wandb
 
-        state = read_json(run.folder / STATE) if (run.folder / STATE).is_file() else {}
+        state = kept_state(run.folder / STATE)
         self.record = wandb.init(
             project=self.options.project or run.scene.name,
             name=run.folder.name,

@@ -213,6 +213,11 @@ def offsets_from(points: Float[Tensor, "P 3"], centre: Float[Tensor, "3"]) -> Fl
     return (points.double() - upload(centre, points.device, torch.float64)).to(points)
 
 
+def centres_of(cameras: Sequence[Camera]) -> Float[Tensor, "K 3"]:
+    """Returns the centres of cameras, world coordinates, float64."""
+    return torch.stack([camera.centre.double() for camera in cameras])
+
+
 def look_at(
     eye: Sequence[float],
     target: Sequence[float],

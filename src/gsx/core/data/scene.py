@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera
+from gsx.core.data.camera import Camera, centres_of
 from gsx.core.data.reduction import Reduction
 from gsx.core.errors import InputError
 from gsx.core.shapes import Bool, Float, UInt8
@@ -152,5 +152,5 @@ class Scene:
 
 def extent_of(cameras: Sequence[Camera]) -> float:
     """Returns 1.1 x the largest distance of a camera centre from their mean (3D-GS, getNerfppNorm)."""
-    centres = torch.stack([camera.centre.double() for camera in cameras])
+    centres = centres_of(cameras)
     return 1.1 * float((centres - centres.mean(0)).norm(dim=1).max())

@@ -1,9 +1,8 @@
 """One splat file of runs that trained on the blocks of a scene: each gives the splats in its cell."""
 
-import json
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from gsx.experiments.runs.bake import bake
 from gsx.experiments.runs.export import explicit_of, refuse_export, write_model
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run
-from gsx.experiments.runs.overrides import quoted
+from gsx.experiments.runs.overrides import words_of
 from gsx.experiments.runs.saved_settings import read_config
 from gsx.experiments.runs.settings import COMPETITOR, SEVERAL, Settings
 from gsx.scenes.blocks import Cell, parsed_block, scene_cells
@@ -49,21 +48,20 @@ def merge_blocks(folders: Sequence[Path], path: Path, plugins: Plugins) -> list[
     refuse_export(path)
     blocks = ordered([Trained(folder=one, settings=settings_of(one, plugins)) for one in folders])
     refuse_different(blocks)
-    whole = [word for word in words_of(blocks[0].settings) if not word.startswith(f"{BLOCK}=")]
-    first = read_config(blocks[0].folder / "config.yaml", plugins, [f"{BLOCK}=''"], (*SEVERAL, COMPETITOR))
-    cells = scene_cells(load_scene(first), len(blocks))
+    whole = settings_of(blocks[0].folder, plugins, [f"{BLOCK}=''"])
+    cells = scene_cells(load_scene(whole), len(blocks))
     parts, run = list[Gaussians](), None
     for block, cell in zip(blocks, cells, strict=True):
         run, _ = open_run(block.folder, plugins)
         parts.append(in_cell(explicit_of(run, None) or bake(run), cell, block.settings.resolved["scene"]["block"]))
     assert run is not None
     write_model(run, joined(parts), path, [f"merged of {len(parts)} blocks"])
-    return whole
+    return scene_words(whole)
 
 
-def settings_of(folder: Path, plugins: Plugins) -> Settings:
-    """Reads the settings of a run."""
-    return read_config(folder / "config.yaml", plugins, (), (*SEVERAL, COMPETITOR))
+def settings_of(folder: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> Settings:
+    """Reads the settings of a run, with some of its keys set to other values."""
+    return read_config(folder / "config.yaml", plugins, overrides, (*SEVERAL, COMPETITOR))
 
 
 def ordered(runs: Sequence[Trained]) -> list[Trained]:
@@ -110,29 +108,17 @@ def drawn_alike(settings: Settings) -> dict[str, Any]:
     return scene | {key: values[key] for key in rules if key in values}
 
 
-def words_of(settings: Settings) -> list[str]:
+def scene_words(settings: Settings) -> list[str]:
     """Returns the words that choose the scene of a run, and the zooms of its evaluation."""
-    values = flattened(settings.resolved)
-    kept = {key: value for key, value in values.items() if key.startswith("scene.") and key != "scene.name"}
-    words = [f"{key}={text_of(value)}" for key, value in kept.items()]
-    return [f"scene={values['scene.name']}", *words, f"eval.zoom={json.dumps(values['eval.zoom'])}"]
-
-
-def text_of(value: Any) -> str:
-    """Returns a value as text of the command line."""
-    return quoted(value) if isinstance(value, str) else json.dumps(value)
+    scene, zooms = dict(settings.resolved["scene"]), settings.resolved["eval"]["zoom"]
+    return [f"scene={scene.pop('name')}", *words_of({"scene": scene, "eval": {"zoom": zooms}})]
 
 
 def in_cell(gaussians: Gaussians, cell: Cell, block: str) -> Gaussians:
     """Returns the splats whose means are in a cell, on the CPU."""
     inside = cell.holds(gaussians.means.detach().cpu())
     logger.info("block %s: %d of %d splats are in its cell", block, int(inside.sum()), len(inside))
-    return mapped(lambda value: value.detach().cpu()[inside], gaussians)
-
-
-def mapped(change: Any, gaussians: Gaussians) -> Gaussians:
-    """Returns Gaussians with each field changed."""
-    return Gaussians(**{field.name: change(getattr(gaussians, field.name)) for field in fields(gaussians)})
+    return Gaussians(**{name: value.detach().cpu()[inside] for name, value in vars(gaussians).items()})
 
 
 def joined(parts: Sequence[Gaussians]) -> Gaussians:

@@ -25,9 +25,9 @@ def prepared_subject(folder: Path, overrides: Sequence[str]) -> Subject:
         InputError: it is unreadable, of another version, or lacks something.
     """
     manifest = read_manifest(folder / MANIFEST)
-    own = values_by_key(map(str, manifest["overrides"]))
-    refuse_other_scene(folder, own, values_by_key(overrides))
-    refuse_vanished(folder, own | values_by_key(overrides))
+    own, chosen = values_by_key(map(str, manifest["overrides"])), values_by_key(overrides)
+    refuse_other_scene(folder, own, chosen)
+    refuse_vanished(folder, own | chosen)
     return Subject(
         overrides=(*map(str, manifest["overrides"]), *overrides),
         own=len(manifest["overrides"]),

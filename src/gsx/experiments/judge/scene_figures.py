@@ -289,19 +289,19 @@ def competitor_on(settings: Settings, scene: Scene, zooms: Sequence[float], fold
 
 def result_of(measured: Measured, scene: Scene) -> dict[str, Any]:
     """Returns the results of one method."""
-    entry = measured.method.entry
+    entry, zooms = measured.method.entry, measured.means()
     return {
         "name": entry.name,
         "repetition": entry.repetition,
         "path": str(entry.path),
         **measured.method.facts(),
-        "notes": [*measured.method.notes, *note_on_photos(measured)],
-        "zoom": measured.means(),
+        "notes": [*measured.method.notes, *note_on_photos(zooms)],
+        "zoom": zooms,
         "views": measured.views,
     }
 
 
-def note_on_photos(measured: Measured) -> list[str]:
-    """Returns a note if the pictures of a method are the photos themselves."""
-    levels = [figures["psnr"] for figures in measured.means().values()]
+def note_on_photos(zooms: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Returns a note if the pictures of a method are the photos themselves, by its figures at each zoom."""
+    levels = [figures["psnr"] for figures in zooms.values()]
     return ["these are the photos themselves: all pixels are equal"] if levels and min(levels) == math.inf else []

@@ -67,8 +67,8 @@ def export(
         InputError: the format cannot hold the splats, or the model cannot be baked.
     """
     columns = own_columns(run) if camera is None else None
-    origin, stated = placement(run.scene.origin, local or is_page(path))
     if columns is not None and suffix_of(path) == STANDARD and not zoom:
+        origin, stated = placement(run.scene.origin, local)
         write_columns(path, columns, [*notes(run), *stated], origin)
         log_coordinates(path, run.scene.origin, local)
         return None

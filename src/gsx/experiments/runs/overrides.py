@@ -1,9 +1,11 @@
 """Words of the command line, `KEY=VALUE` by Hydra's grammar: written, read, and refused with clearer errors."""
 
+import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
 from shutil import which
 from typing import Any, NoReturn
 
@@ -51,6 +53,36 @@ def word_of(key: str, text: str) -> str:
     plain = re.fullmatch(r"[A-Za-z/][\w./:-]*( [\w./:-]+)*", text, re.ASCII)
     bare = plain and text.lower() not in ("null", "true", "false", "nan", "inf")
     return f"{key}={text if bare else quoted(text)}"
+
+
+def words_of(values: Mapping[str, Any], below: str = "") -> list[str]:
+    """Return values by name, nested ones too, as words of the command line."""
+    words = []
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            words += words_of(value, f"{below}{name}.")
+        else:
+            words.append(f"{below}{name}={text_of(plain(name, value))}")
+    return words
+
+
+def text_of(value: Any) -> str:
+    """Return a plain value in the syntax of the command line."""
+    if isinstance(value, list):
+        return f"[{','.join(map(text_of, value))}]"
+    return quoted(value) if isinstance(value, str) else json.dumps(value)
+
+
+def plain(name: str, value: Any) -> Any:
+    """Return a value of JSON: convert numbers of numpy and torch, and paths; raise ConfigError for other types."""
+    if isinstance(value, list | tuple):
+        return [plain(name, inner) for inner in value]
+    if isinstance(value, Path):
+        return str(value)
+    value = value.tolist() if hasattr(value, "tolist") else value
+    if not (value is None or isinstance(value, bool | int | float | str | list)):
+        raise ConfigError(f"{name} is a {type(value).__name__}; give a number, a text, a list of them, or null")
+    return value
 
 
 def with_quoted_paths(overrides: Sequence[str]) -> list[str]:

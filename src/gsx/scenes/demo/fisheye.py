@@ -22,12 +22,17 @@ COEFFICIENTS = (0.03, -0.02, 0.004, -0.001)
 
 def fisheye(degrees: float, width: int, height: int) -> Any:
     """Return the pycolmap camera of this horizontal angle of view, with square pixels."""
-    import pycolmap
-
     half = math.radians(degrees / 2)
     focal = width / 2 / (half * (1 + sum(k * half ** (2 * n + 2) for n, k in enumerate(COEFFICIENTS))))
-    params = [focal, focal, width / 2, height / 2, *COEFFICIENTS]
-    return pycolmap.Camera(model="OPENCV_FISHEYE", width=width, height=height, params=params)
+    return model_of((width, height), focal, focal, width / 2, height / 2)
+
+
+def model_of(size: tuple[int, int], *intrinsics: float) -> Any:
+    """Return the pycolmap camera of this lens; intrinsics: fx, fy, cx, cy."""
+    import pycolmap
+
+    params = [*intrinsics, *COEFFICIENTS]
+    return pycolmap.Camera(model="OPENCV_FISHEYE", width=size[0], height=size[1], params=params)
 
 
 def through_fisheye(cameras: Cameras, degrees: float) -> Cameras:
@@ -75,11 +80,8 @@ def straightened(views: Sequence[View], cache: ImageCache) -> list[View]:
 
 
 def _straightened(view: View, cache: ImageCache) -> View:
-    import pycolmap
-
     photo = view.camera
-    params = [photo.fx, photo.fy, photo.cx, photo.cy, *COEFFICIENTS]
-    intrinsics = pycolmap.Camera(model="OPENCV_FISHEYE", width=photo.width, height=photo.height, params=params)
+    intrinsics = model_of(photo.size, photo.fx, photo.fy, photo.cx, photo.cy)
     pinhole = pinhole_of(intrinsics)
     camera = replace(camera_of(pinhole, photo.rotation, photo.translation), near=photo.near)
     source = StraightenedSource(source=view.source, photo=photo, intrinsics=intrinsics, pinhole=pinhole, cache=cache)

@@ -226,15 +226,12 @@ def provenance(options: RayCastOptions, name: str, version: str, split: str) -> 
     """Return everything that decides the pictures, for the evaluation protocol; `split`: of its cameras."""
     somebody = {"passer_by": True} if options.passer_by else {}
     lens = {"fisheye": options.fisheye, "lens": options.lens} if options.fisheye else {}
-    return (
-        somebody
-        | lens
-        | {
-            "format": name,
-            "version": version,
-            "size": list(size_of(options)),
-            "samples": options.samples,
-            "light": "display",
-            "split": split + (", all trained on" if options.split == "none" else ""),
-        }
-    )
+    return somebody | {
+        **lens,
+        "format": name,
+        "version": version,
+        "size": list(size_of(options)),
+        "samples": options.samples,
+        "light": "display",
+        "split": split + (", all trained on" if options.split == "none" else ""),
+    }
