@@ -145,8 +145,8 @@ class Anchors(SceneModel):
         return metrics
 
     def milestones(self) -> list[int]:
-        """Returns the step at which growth ends."""
-        return [self.events.stop]
+        """Returns the events of growth, and the step at which it ends."""
+        return [*self.events.steps(), self.events.stop]
 
     def grow_and_prune(self, step: int) -> dict[str, float]:
         """Grows, resets eligible offsets, prunes and clamps in the order of the reference (Scaffold-GS)."""

@@ -47,6 +47,10 @@ class EventSteps:
         """Returns whether a step has an event."""
         return self.start < step < self.stop and step % self.every == 0
 
+    def steps(self) -> list[int]:
+        """Returns the steps with an event, in order."""
+        return list(range((self.start // self.every + 1) * self.every, self.stop, self.every))
+
     def count(self) -> int:
         """Returns the number of events; 0 or less: none."""
         return (self.stop - 1) // self.every - self.start // self.every

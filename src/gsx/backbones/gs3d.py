@@ -191,8 +191,8 @@ class GS3D(SceneModel):
         return metrics
 
     def milestones(self) -> list[int]:
-        """Returns when density control ends, and when SH degrees are chosen."""
-        return [self.control.events.stop, self.sh_step()]
+        """Returns the events of density control, when it ends, and when SH degrees are chosen."""
+        return [*self.control.events.steps(), self.control.events.stop, self.sh_step()]
 
     def sh_step(self) -> int:
         """Returns the step at which SH degrees are chosen; 0: at none."""

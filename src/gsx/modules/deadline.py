@@ -16,7 +16,7 @@ from gsx.core.errors import ConfigError
 from gsx.core.ranges import MOST_STEPS, Range, Seconds, Share, Steps
 from gsx.core.training.module import ModuleContext, TrainingModule
 from gsx.core.training.run import Run
-from gsx.modules.milestones import last_milestone
+from gsx.modules.milestones import last_milestone, next_milestone
 
 logger = logging.getLogger(__name__)
 
@@ -26,8 +26,8 @@ RECENT = 4
 """Windows whose pace is that of the rest."""
 SLACK = 0.03
 """Share of the time by which a run may be late before it skips steps."""
-LEAST, LEAST_END = 0.1, 0.5
-"""Least share of the steps that a window takes: before the last stretch, and in it."""
+LEAST_EARLY, LEAST, LEAST_END = 0.6, 0.1, 0.5
+"""Least share of the steps that a window takes: before the last milestone, before the last stretch, and in it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +40,8 @@ class DeadlineOptions:
     """Steps of the planned run; a run of another length has no deadline."""
     planned: Annotated[list[float], Range(0, 10**9)] = field(default_factory=list)
     """Planned seconds of training after equal shares of the steps, the last: all."""
-    start: Share = 0.5
-    """Share of the steps before any are skipped; later if a milestone is later."""
+    start: Share = 0.2
+    """Share of the steps before any are skipped."""
     to: Share = 0.8
     """Share of the steps at which the last stretch begins."""
     skip: Annotated[list[int], Range(1, MOST_STEPS)] = field(default_factory=list)
@@ -118,7 +118,7 @@ class Deadline(TrainingModule):
         """Returns the deadline and the steps that may be skipped."""
         if not self.active:
             return {}
-        may = {"may_skip_from": self.first_allowed(run, self.last_stretch), "to": self.last_stretch}
+        may = {"may_skip_from": self.first_allowed(), "to": self.last_stretch}
         return {"deadline": {"seconds": self.options.seconds} | may}
 
     @classmethod
@@ -142,12 +142,17 @@ class Deadline(TrainingModule):
         if run.step % window:
             return 0
         self.mark(run)
-        before_end = run.step < self.last_stretch
-        stop = self.last_stretch if before_end else self.context.iterations
-        if run.step < self.first_allowed(run, stop):
+        stop = self.last_stretch if run.step < self.last_stretch else self.context.iterations
+        if run.step < self.first_allowed():
             return 0
-        taken = min(1.0, max(LEAST if before_end else LEAST_END, self.share_in_time(run.step)))
-        return min(run.step + math.floor((1 - taken) * window), stop - 1)
+        taken = min(1.0, max(self.least_taken(run, stop), self.share_in_time(run.step)))
+        return min(run.step + math.floor((1 - taken) * window), next_milestone(run, run.step, stop) - 1)
+
+    def least_taken(self, run: Run, stop: int) -> float:
+        """Returns the least share of the steps that a window takes."""
+        if run.step >= self.last_stretch:
+            return LEAST_END
+        return LEAST_EARLY if run.step < last_milestone(run, stop) else LEAST
 
     def mark(self, run: Run) -> None:
         """Notes the clock before a window."""
@@ -170,9 +175,9 @@ class Deadline(TrainingModule):
         first = self.marks[0] if len(self.marks) > 1 else (0, 0.0, 0.0)
         return (self.marks[-1][1] - first[1]) / (self.marks[-1][2] - first[2])
 
-    def first_allowed(self, run: Run, before: int) -> int:
-        """Returns the step after which others may be skipped: after all milestones before a step."""
-        return max(1, round(self.options.start * self.context.iterations), last_milestone(run, before))
+    def first_allowed(self) -> int:
+        """Returns the step after which others may be skipped."""
+        return max(1, round(self.options.start * self.context.iterations))
 
     def planned_until(self, step: int) -> float:
         """Returns the planned seconds of the first steps."""

@@ -46,7 +46,7 @@ UNCHANGED = {
 }
 """Keys newer than the first digests, with their neutral values, which do not count."""
 WITHOUT_EFFECT: dict[str, dict[str, Any]] = {
-    "training.deadline": {"seconds": 0.0, "steps": 0, "planned": [], "start": 0.5, "to": 0.8, "skip": []},
+    "training.deadline": {"seconds": 0.0, "steps": 0, "planned": [], "start": 0.2, "to": 0.8, "skip": []},
     "backbone.mcmc": {"primitives": 0},
 }
 """Nodes newer than the first digests, with values by which they change nothing and do not count."""
