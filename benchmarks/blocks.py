@@ -1,10 +1,9 @@
 """Blocks of a scene against the model in one piece: three built-in rooms, held-out views near the cuts and elsewhere.
 
-    python benchmarks/blocks.py [--seeds 0] [--steps 1500] [--count 3] [--runs FOLDER]
+    python benchmarks/blocks.py [--seeds 0] [--steps 1000,3000] [--whole 3000] [--count 3] [--runs FOLDER]
 
-Each block takes --steps, and the model in one piece as many as all blocks together. It may grow to 30,000 primitives,
-each block to half of that, since it also learns what is around its cell. Finished runs are kept. Ten minutes a seed on
-one core.
+The model in one piece takes --whole steps and has 30,000 primitives, each block --steps and two thirds of that, since
+it also learns what is around its cell. Finished runs are kept. Forty minutes a seed on one core.
 """
 
 import argparse
@@ -33,7 +32,14 @@ QUICK = ("training.cooldown=0.25", "training.supersampling.start=0.95", "backbon
 WHOLE, NEAR = 30_000, 1.2
 """Primitives of the model in one piece, and distance from a cut within which a test camera is near it, scene units."""
 COLUMNS = [
-    *(["seed", "seed"], ["model", "model"], ["x1", "x1, dB"], ["x4", "x4, dB"], ["near", "near cuts, dB"]),
+    *(
+        ["seed", "seed"],
+        ["model", "model"],
+        ["steps", "steps"],
+        ["x1", "x1, dB"],
+        ["x4", "x4, dB"],
+        ["near", "near cuts, dB"],
+    ),
     *(["far", "elsewhere, dB"], ["worst", "worst view, dB"], ["primitives", "primitives"], ["seconds", "training, s"]),
 ]
 Row = dict[str, object]
@@ -67,31 +73,45 @@ def figures(folder: Path, near: set[str]) -> Row:
     }
 
 
-def measure(seed: int, options: argparse.Namespace, near: set[str]) -> list[Row]:
-    """Trains the scene in one piece and in blocks."""
-    count, base = options.count, options.runs / f"{seed}_{options.steps}"
-    whole = train(base / "whole", words_for(seed, options.steps * count, WHOLE))
-    own, blocks = words_for(seed, options.steps, WHOLE // 2), [f"{number}/{count}" for number in range(1, count + 1)]
-    folders = [base / f"block_{number}" for number in range(1, count + 1)]
-    trained = [train(folder, [*own, f"scene.block={block}"]) for folder, block in zip(folders, blocks, strict=True)]
-    seconds = sum(one["train_seconds"] for one in trained)
-    merged, file = base / "merged", base / "merged.ply"
+def trained_blocks(seed: int, steps: int, options: argparse.Namespace) -> tuple[list[Path], float]:
+    """Folders of the runs on all blocks, and the seconds of their training, one after the other."""
+    blocks = range(1, options.count + 1)
+    folders = [options.runs / f"block_{block}_{options.count}_{steps}_{seed}" for block in blocks]
+    words, found = words_for(seed, steps, options.primitives), []
+    for folder, block in zip(folders, blocks, strict=True):
+        found.append(train(folder, [*words, f"scene.block={block}/{options.count}"])["train_seconds"])
+    return folders, sum(found)
+
+
+def merged_row(seed: int, steps: int, options: argparse.Namespace, near: set[str]) -> Row:
+    """Trains and merges blocks; returns the figures of the merged model."""
+    folders, seconds = trained_blocks(seed, steps, options)
+    merged = options.runs / f"merged_{options.count}_{steps}_{seed}"
+    file = merged.with_suffix(".ply")
     if not (merged / "evaluation.json").is_file():
         merge_blocks(folders, file, plugins())
         gsx(["eval", str(file), *SCENE, "eval.zoom=[1,2,4]", f"folder={merged}"])
-    rows = [
-        {"model": "in one piece", "seconds": whole["train_seconds"]} | figures(base / "whole", near),
-        {"model": f"{count} blocks, merged", "seconds": seconds} | figures(merged, near),
-    ]
-    assert rows[1]["primitives"] == len(read_splats(file).gaussians.means)
-    return [{"seed": seed} | row for row in rows]
+    row = {"model": f"{options.count} blocks, merged", "steps": steps, "seconds": seconds} | figures(merged, near)
+    assert row["primitives"] == len(read_splats(file).gaussians.means)
+    return {"seed": seed} | row
+
+
+def measure(seed: int, options: argparse.Namespace, near: set[str]) -> list[Row]:
+    """Trains the scene in one piece and in blocks."""
+    folder = options.runs / f"whole_{options.whole}_{seed}"
+    whole = train(folder, words_for(seed, options.whole, WHOLE))
+    row = {"seed": seed, "model": "in one piece", "steps": options.whole, "seconds": whole["train_seconds"]}
+    steps = [int(one) for one in options.steps.split(",")]
+    return [row | figures(folder, near), *(merged_row(seed, one, options, near) for one in steps)]
 
 
 def main(words: Sequence[str]) -> None:
     """Trains, merges and writes the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="0", help="by commas (0)")
-    parser.add_argument("--steps", type=int, default=1500, help="steps of a block (1500)")
+    parser.add_argument("--whole", type=int, default=3000, help="steps of the model in one piece (3000)")
+    parser.add_argument("--steps", default="1000,3000", help="steps of a block, by commas (1000,3000)")
+    parser.add_argument("--primitives", type=int, default=2 * WHOLE // 3, help="budget of a block (20000)")
     parser.add_argument("--count", type=int, default=3, help="blocks (3)")
     parser.add_argument("--runs", type=Path, default=Path("outputs/blocks"), help="folder of the runs")
     parser.add_argument("--to", type=Path, default=RESULTS, help="folder of the results")
@@ -99,8 +119,8 @@ def main(words: Sequence[str]) -> None:
     near = views_near_cuts(options.count)
     rows = [row for seed in options.seeds.split(",") for row in measure(int(seed), options, near)]
     notes = [
-        f"Held-out views; {len(near)} of 18 are within {NEAR:g} units of a cut. A block takes {options.steps:,} steps, "
-        f"the model in one piece {options.count * options.steps:,}. Seconds of all blocks, one after the other."
+        f"Held-out views; {len(near)} of 18 are within {NEAR:g} units of a cut. Steps of each block; seconds of all "
+        f"blocks, one after the other. A block has {options.primitives:,} splats, of which those in its cell are kept."
     ]
     command = shown_command(words, "benchmarks/blocks.py")
     sections: dict[str, Section] = {"blocks": stamped("Blocks and one piece", COLUMNS, rows, notes, load, command)}

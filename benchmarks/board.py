@@ -50,7 +50,7 @@ BASE = "gs3d"
 """Method that others are compared with."""
 SCENE = {"demo": ("scene.downscale=2",), "lego": ("scene.random_points=10000",)}
 """What a plan of two minutes on one core chooses for a scene, for all methods."""
-ATTEMPTS, TOLERANCE = 3, 0.15
+ATTEMPTS, TOLERANCE = 4, 0.15
 """Runs at the most until one keeps the minutes, and the share of them to miss."""
 REFUSED, FEW = "give more minutes", 200
 """In the log of a plan that finds the minutes too short, and the steps of the run instead."""
@@ -146,7 +146,7 @@ def trained(bench: Bench, method: str, scene: str) -> Row:
         kept += [] if row["compiled"] else [row]
         if attempt > ATTEMPTS or (kept and missed(bench, kept[-1]) <= TOLERANCE):
             break
-        words = repeated(row, bench.goal) if kept else row["words"]
+        words = repeated(kept, bench.goal) if kept else row["words"]
         row = attempted(bench, bench.folder(method, scene, attempt), words)
     return min(kept, key=lambda row: missed(bench, row))
 
@@ -189,10 +189,11 @@ def attempted(bench: Bench, folder: Path, words: Sequence[str]) -> Row:
     }
 
 
-def repeated(row: Row, goal: float) -> list[str]:
+def repeated(rows: Sequence[Row], goal: float) -> list[str]:
     """Returns the words of a planned run without its clock and its short measurement, in steps that last the goal."""
+    row, used = rows[-1], [(row["steps"], row["seconds"] - row["before"]) for row in rows]
     other = row["seconds"] - row["train_seconds"] - row["before"]
-    steps = round(row["steps"] * (goal - other) / row["train_seconds"])
+    steps = steps_for(goal, used) if len(used) > 1 else round(row["steps"] * (goal - other) / row["train_seconds"])
     return [*(word for word in row["repeat"] if not word.startswith("iterations=")), f"iterations={steps}"]
 
 

@@ -3,7 +3,7 @@
     python benchmarks/memory.py SCENES [--only fox,many] [--against REVISION]
 
 SCENES holds the folder `fox` (COLMAP). `many` is a capture of 500 photos that is made in a temporary folder: random
-pictures, since memory does not depend on what photos show. Linux only; one process after the other.
+pictures, since memory does not depend on what photos show, and 100,000 points. Linux only; one process after the other.
 """
 
 import argparse
@@ -22,19 +22,21 @@ import torch
 
 from gsx.core.data.camera import look_at
 from gsx.core.data.images import write_image
+from gsx.core.data.scene import PointCloud
 from gsx.core.files import write_json
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run
+from gsx.experiments.prepare.transforms_file import write_points
 from measuring.machine import ROOT, describe_machine, shown_command, told_load
 from measuring.memory import MB, forget_peak, host_peak, unmeasurable
 from measuring.results import stamped, text_table, write_results
 from measuring.revisions import checked_out
 
 RESULTS = Path(__file__).parent / "results"
-PHOTOS, WIDTH, HEIGHT = 500, 1600, 1200
+PHOTOS, WIDTH, HEIGHT, POINTS = 500, 1600, 1200, 100_000
 SUBJECTS = {
     "fox": ["scene=colmap", "scene.downscale=4", "iterations=600"],
-    "many": ["scene=transforms", "scene.split=none", "scene.random_points=20000", "iterations=20"],
+    "many": ["scene=transforms", "scene.split=none", "iterations=20"],
 }
 """Settings by scene; those of `many` are the shortest run with steps of all sizes."""
 PHASES = ("start", "steps", "finer steps", "evaluation")
@@ -103,7 +105,7 @@ def peaks_of(source: Path, words: Sequence[str]) -> dict[str, float]:
 
 
 def make_capture(folder: Path, photos: int = PHOTOS, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
-    """Writes a capture in the form of nerfstudio: cameras on a ring, random pictures."""
+    """Writes a capture in the form of nerfstudio: cameras on a ring, random pictures, points on a sphere."""
     generator, (width, height), frames = torch.Generator().manual_seed(0), size, []
     coarse = torch.rand(1, 3, height // 16, width // 16, generator=generator)
     picture = torch.nn.functional.interpolate(coarse, size=(height, width), mode="bicubic").clamp(0, 1)[0]
@@ -116,8 +118,11 @@ def make_capture(folder: Path, photos: int = PHOTOS, size: tuple[int, int] = (WI
         to_world[:3, 3] = camera.centre.float()
         write_image(folder / f"{index}.jpg", picture.roll(index * width // photos, 2))
         frames.append({"file_path": f"{index}.jpg", "transform_matrix": to_world.tolist()})
+    directions = torch.nn.functional.normalize(torch.randn(POINTS, 3, generator=generator), dim=1)
+    grey = torch.full((POINTS, 3), 128, dtype=torch.uint8)
+    write_points(folder / "points.ply", PointCloud(directions, grey), (0, 0, 0))
     lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": width, "h": height}
-    write_json(folder / "transforms.json", lens | {"frames": frames})
+    write_json(folder / "transforms.json", lens | {"frames": frames, "ply_file_path": "points.ply"})
 
 
 def row_of(name: str, source: Path, scenes: Path, label: str) -> dict[str, Any]:

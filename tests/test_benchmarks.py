@@ -1,5 +1,6 @@
 """The benchmarks on tiny sizes: that they measure what they say, on yardsticks that are right themselves."""
 
+import itertools
 import json
 import math
 import sys
@@ -541,6 +542,31 @@ def test_the_capture_for_memory_is_read_with_its_cameras(tmp_path: Path) -> None
         places, depths = view.camera.project(torch.zeros(1, 3))
         assert torch.allclose(places, torch.tensor([[32.0, 24.0]]), atol=1e-3)
         assert float(depths) == pytest.approx(math.hypot(3, 0.5), rel=1e-5)
+
+
+def test_thirds_of_a_photo_have_as_many_pixels_each() -> None:
+    """Of a pinhole as well as of a lens whose angles are its distances from the axis."""
+    import lenses
+    from gsx.core.data.camera import look_at
+    from gsx.lenses.models import Distortion
+
+    pinhole = look_at((0, -3, 0), (0, 0, 0), fov_x=1.2, width=60, height=50)
+    for camera in (pinhole, replace(pinhole, lens=Distortion(fisheye=True))):
+        borders, angle = lenses.borders_of(camera), lenses.tangents(camera)
+        counts = [int(((angle >= low) & (angle < high)).sum()) for low, high in itertools.pairwise(borders)]
+        assert sum(counts) == 3000
+        assert max(counts) - min(counts) <= 30  # pixels at equal distances are not divided
+    assert float(lenses.tangents(pinhole)[0, 0]) == pytest.approx(math.hypot(29.5, 24.5) / pinhole.fx, rel=1e-5)
+    radius = math.hypot(29.5, 24.5) / camera.fx
+    assert float(lenses.tangents(camera)[0, 0]) == pytest.approx(math.tan(radius), rel=1e-5)
+
+
+def test_the_level_of_marked_pixels() -> None:
+    import lenses
+
+    psnr = lenses.decibels(torch.tensor([[0.01, 0.04], [0.0001, 9.0]]))
+    assert psnr(torch.tensor([[True, False], [False, False]])) == pytest.approx(20)
+    assert psnr(torch.tensor([[True, True], [False, False]])) == pytest.approx(-10 * math.log10(0.025))
 
 
 def test_a_phase_has_the_largest_of_its_peaks(monkeypatch: pytest.MonkeyPatch) -> None:
