@@ -328,11 +328,21 @@ def parse_scenes(arguments: list[str]) -> argparse.Namespace:
 
 
 def parse_datasets(arguments: list[str]) -> argparse.Namespace:
-    """Parse `gsx datasets [NAME ...] [data_root=FOLDER]`."""
-    description = "List the paper's datasets: the folders that gsx expects below data_root, and those that are missing."
-    parser = Parser("datasets", description, "[NAME ...] [data_root=FOLDER]")
+    """Parse `gsx datasets [NAME ...] [data_root=FOLDER] [--get NAME [--to FOLDER]]`."""
+    description = (
+        "List public datasets: the folders that gsx expects below data_root, what is missing, size and licence. With "
+        "--get NAME fetch one: a cut download continues, archives are compared with their checksum and unpacked."
+    )
+    parser = Parser("datasets", description, "[NAME ...] [--get NAME [dataset.scene=SCENE]] [data_root=FOLDER]")
     parser.add_argument("words", nargs="*", metavar="NAME", help="datasets (all)")
-    return parser.parse_args(arguments)
+    parser.add_argument("--get", metavar="NAME", help="dataset to fetch; dataset.scene=SCENE: only this scene")
+    parser.add_argument("--to", type=Path, metavar="FOLDER", help="folder for it, as data_root=FOLDER (data)")
+    options = parser.parse_intermixed_args(arguments)
+    if options.to and (not options.get or any(word.startswith("data_root=") for word in options.words)):
+        raise InputError("gsx datasets: --to FOLDER goes with --get NAME, in place of data_root=FOLDER")
+    if options.get and (names := [word for word in options.words if "=" not in word]):
+        raise InputError(f"gsx datasets --get fetches one dataset: leave {names[0]} for another call")
+    return options
 
 
 def parse_explain(arguments: list[str]) -> argparse.Namespace:

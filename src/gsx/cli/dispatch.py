@@ -37,7 +37,7 @@ More commands; view, eval and export also take splat files of other programs:
   gsx render RUN             save test views as PNG; animate --orbit FILE.gif or a camera --path FILE.json
   gsx compact RUN            shrink a model while PSNR drops by at most 0.1 dB; merge joins runs on blocks of a scene
   gsx report DIR ...         write report.html of a run, or one page that compares all runs below some folders
-  gsx explain KEY            explain a setting; gsx datasets, gsx plugins list datasets and components on this machine
+  gsx explain KEY            explain a setting; gsx datasets [--get NAME] lists or fetches datasets; gsx plugins: components
 
 Every setting is a word KEY=VALUE:
   gsx scene=colmap scene.path=FOLDER scene.downscale=4 iterations=2000 'eval.zoom=[1,2,4]'
@@ -151,7 +151,7 @@ VERBS = {
     "report": command(parsers.parse_report, "facts", "report"),
     "scenes": command(parsers.parse_scenes, "facts", "check_scene"),
     "prepare": command(parse_prepare, "prepare", "prepare_scene"),
-    "datasets": command(parsers.parse_datasets, "facts", "list_datasets"),
+    "datasets": command(parsers.parse_datasets, "facts", "datasets"),
     "explain": command(parsers.parse_explain, "facts", "explain_key"),
     "plugins": command(parsers.parse_plugins, "facts", "list_plugins"),
 }

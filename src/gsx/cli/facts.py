@@ -7,11 +7,15 @@ from pathlib import Path
 
 from gsx.builtin import plugins
 from gsx.core.errors import InputError, nearest
+from gsx.core.files import expand_home
 from gsx.core.plugins import KINDS
+from gsx.experiments.download.get import get
 from gsx.experiments.reports.report import report_on
 from gsx.experiments.runs.compose import Compositions, listed
 from gsx.experiments.runs.explain import explain
 from gsx.experiments.runs.inspect import describe
+from gsx.experiments.runs.settings import Dataset
+from gsx.experiments.runs.typed import typed
 from gsx.experiments.tables.datasets import described
 
 
@@ -35,14 +39,47 @@ def check_scene(options: Namespace) -> int:
     return 2 if any(line.startswith("problem") for line in lines) else 0
 
 
+def datasets(options: Namespace) -> int:
+    """Fetch one dataset, or print the folders of datasets that are there and those that are missing."""
+    return get_dataset(options) if options.get else list_datasets(options)
+
+
+def get_dataset(options: Namespace) -> int:
+    """Fetch the scenes of a dataset that are missing, with `dataset.scene=SCENE` only that one."""
+    place = [f"data_root={options.to}"] if options.to else []
+    words = [f"dataset={options.get}", *options.words, *place]
+    with Compositions(plugins()) as compositions:
+        refuse_unknown_dataset(options.get, known_datasets())
+        dataset = typed(Dataset, compositions.node(words, "dataset"), "dataset")
+        root = expand_home(str(compositions.value(words, "data_root")))
+    chosen = any(word.startswith("dataset.scene=") for word in words)
+    scenes = [dataset.scene] if chosen else list(dataset.scenes)
+    if dataset.scene not in dataset.scenes:
+        raise InputError(f"Unknown scene '{dataset.scene}'. Choose from {', '.join(dataset.scenes)}")
+    for line in get(dataset, root, scenes):
+        write_lines([line])
+        sys.stdout.flush()  # before a long download, also to a file
+    return 0
+
+
+def known_datasets() -> list[str]:
+    """Return the names of datasets that name scenes."""
+    return [name for name in listed("dataset") if name not in ("none", "own")]
+
+
+def refuse_unknown_dataset(name: str, known: list[str]) -> None:
+    """Raise InputError with the nearest name for a dataset that does not exist."""
+    if name not in known:
+        raise InputError(f"Unknown dataset '{name}'. Choose from {', '.join(known)}.{nearest(name, known)}")
+
+
 def list_datasets(options: Namespace) -> int:
     """Print the folders of datasets that are there and those that are missing."""
     overrides = [word for word in options.words if "=" in word]
     with Compositions(plugins()) as compositions:
-        known = [name for name in listed("dataset") if name not in ("none", "own")]  # they name no scenes
+        known = known_datasets()
         for name in [word for word in options.words if "=" not in word] or known:
-            if name not in known:
-                raise InputError(f"Unknown dataset '{name}'. Choose from {', '.join(known)}.{nearest(name, known)}")
+            refuse_unknown_dataset(name, known)
             words = [f"dataset={name}", *overrides]
             root = Path(str(compositions.value(words, "data_root")))
             if any(word.startswith("data_root=") for word in overrides) and not root.is_dir():

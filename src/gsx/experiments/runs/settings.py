@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.resources import as_file, files
+from pathlib import Path
 from typing import Annotated, Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -51,6 +52,29 @@ class Budget:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Archive:
+    """A ZIP file of a dataset's authors, for `gsx datasets --get`."""
+
+    file: str
+    """Name below data_root/archives."""
+    url: str = ""
+    """Public address; empty: fetch it by hand."""
+    scenes: list[str]
+    """Scenes that it holds."""
+    megabytes: Annotated[int, Range(0, 10**7)] = 0
+    """Size, 10^6 bytes, rounded; 0: not known before the server states it."""
+    sha256: str = ""
+    """Published checksum; empty: none is published."""
+
+    def __post_init__(self) -> None:
+        """Refuse names with folders, and addresses of other protocols than HTTP."""
+        if Path(self.file).name != self.file:
+            raise ValueError(f"dataset.archives: file '{self.file}' has to be a name without folders")
+        if self.url and not self.url.startswith(("https://", "http://")):
+            raise ValueError(f"dataset.archives: url '{self.url}' has to start with https:// or http://")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Dataset:
     """Published scenes below one folder; values in conf/dataset."""
 
@@ -69,6 +93,10 @@ class Dataset:
     """Published number of images in a scene's folder `images`, by scene."""
     scene: str
     """Scene to train."""
+    licence: str = ""
+    """Terms of use as its authors state them, or where; empty: they state none."""
+    archives: list[Archive] = dataclasses.field(default_factory=list)
+    """Files that hold its scenes."""
 
 
 @dataclass(frozen=True, kw_only=True)

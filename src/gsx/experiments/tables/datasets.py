@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from gsx.core.errors import command
 from gsx.core.files import expand_home, file_count
 
 
@@ -23,10 +24,25 @@ def missing(dataset: dict[str, Any], scene: str, root: Path) -> str:
     return f"{few} (++dataset.images.{scene}={found} takes them)" if found < published else ""
 
 
+def licence_of(dataset: dict[str, Any]) -> str:
+    """Returns a dataset's licence in words."""
+    return (
+        f"licence: {dataset.get('licence') or 'none found that its authors state; ask them before you publish with it'}"
+    )
+
+
+def size_of(archive: dict[str, Any]) -> str:
+    """Returns an archive's size in words."""
+    if size := archive.get("megabytes", 0):
+        return f"about {size / 1e3:.3g} GB" if size >= 1e3 else f"about {size} MB"
+    return "size unknown until its server states it" if archive.get("url") else "fetched by hand"
+
+
 def described(dataset: dict[str, Any], root: Path) -> Iterator[str]:
     """Describes a dataset in lines: what is expected, found and missing, and where it can be had."""
     scenes = list(dataset["scenes"])
     lacking = {scene: reason for scene in scenes if (reason := missing(dataset, scene, root))}
+    archives = dataset.get("archives", [])
     found = [scene for scene in scenes if scene not in lacking]
     yield f"{dataset['name']}: {dataset['title']}, {len(found)} of {len(scenes)} scenes found"
     if dataset["folder"]:
@@ -40,3 +56,9 @@ def described(dataset: dict[str, Any], root: Path) -> Iterator[str]:
             yield f"  damaged:  {reason}"
     if lacking:
         yield f"  from:     {dataset['obtained']}"
+    for archive in archives:
+        yield f"  archive:  {archive['file']}, {size_of(archive)}"
+    if archives:
+        yield f"  {licence_of(dataset).replace(': ', ':  ', 1)}"
+    if any(archive.get("url") and lacking.keys() & set(archive["scenes"]) for archive in archives):
+        yield f"  fetch:    {command('datasets', '--get', dataset['name'])}"

@@ -1,0 +1,1 @@
+"""Public datasets: fetch their archives, check them, unpack them."""
