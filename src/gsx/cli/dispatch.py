@@ -37,7 +37,7 @@ More commands; view, eval and export also take splat files of other programs:
   gsx render RUN             save test views as PNG; animate --orbit FILE.gif or a camera --path FILE.json
   gsx compact RUN            shrink a model while PSNR drops by at most 0.1 dB; merge joins runs on blocks of a scene
   gsx report DIR ...         write report.html of a run, or one page that compares all runs below some folders
-  gsx explain KEY            explain a setting; gsx datasets [--get NAME] lists or fetches datasets; gsx plugins: components
+  gsx explain KEY            explain a setting; gsx datasets [--get NAME]: list or fetch datasets; gsx plugins
 
 Every setting is a word KEY=VALUE:
   gsx scene=colmap scene.path=FOLDER scene.downscale=4 iterations=2000 'eval.zoom=[1,2,4]'
