@@ -6,6 +6,7 @@ from gsx.core.training.module import TrainingModule
 from gsx.modules.blur import Blur, BlurOptions
 from gsx.modules.coarse_to_fine import CoarseToFine, CoarseToFineOptions
 from gsx.modules.deadline import Deadline, DeadlineOptions
+from gsx.modules.depth import Depth, DepthOptions
 from gsx.modules.distractors import DistractorOptions, Distractors
 from gsx.modules.exposure import Exposure, ExposureOptions
 from gsx.modules.plateau import Plateau, PlateauOptions
@@ -23,5 +24,6 @@ MODULES: Mapping[str, tuple[type[TrainingModule], type]] = {
     "exposure": (Exposure, ExposureOptions),
     "blur": (Blur, BlurOptions),
     "distractors": (Distractors, DistractorOptions),
+    "depth": (Depth, DepthOptions),
 }
 """Module and options by name."""

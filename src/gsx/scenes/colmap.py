@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import image_size, is_reduction
-from gsx.core.data.scene import Scene, View
+from gsx.core.data.scene import Depths, Scene, View
 from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError
 from gsx.core.files import expand_home, is_file
@@ -95,7 +95,9 @@ def build(
         )
         for image in present
     ]
-    views = views_of(shots, options)
+    views = [
+        replace(view, sparse=depths_of(view, one)) for view, one in zip(views_of(shots, options), present, strict=True)
+    ]
     fit = check_cameras(model, present, shots, views, options.max_reprojection_px)
     train, test = split_names([view.name for view in views], options.split, path, photos_of(views))
     sides = [views[index] for index in train], [views[index] for index in test]
@@ -108,6 +110,17 @@ def build(
         **({} if options.adjust == "never" else {"adjust": options.adjust}),
     }
     return scene_of(options, path, views, sides, model.points, notes, details)
+
+
+def depths_of(view: View, image: ModelImage) -> Depths:
+    """Return the depths of the points that a view observes, weighted by their reprojection errors e.
+
+    Weights are exp(-(e / mean e)^2), as in DS-NeRF (Deng et al. 2022, load_llff.py), and 1 where e is unknown.
+    """
+    pixels, z = (values.float() for values in view.camera.project(image.observed))
+    used, mean = view.camera.shows(pixels, z), image.errors.nanmean().clamp_min(torch.finfo(torch.float32).tiny)
+    weights = (-(image.errors / mean).square()).exp().nan_to_num(1.0).float()
+    return Depths(pixels=pixels[used], z=z[used], weights=weights[used])
 
 
 # -- images ------------------------------------------------------------------------------------------------------------

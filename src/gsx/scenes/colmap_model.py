@@ -51,6 +51,8 @@ class ModelImage:
     """Observed positions in pixels of the model's camera, pixel centres at +0.5, float64; evenly drawn from all."""
     observed: Float[Tensor, "K 3"]
     """The world points at these keypoints, float64."""
+    errors: Float[Tensor, "K"]
+    """Their mean reprojection errors, px, float64; NaN: unknown."""
     lost: int = 0
     """Number of observations without their point, which has been removed from the model."""
 
@@ -103,15 +105,16 @@ def read_model(folder: Path) -> Model:
     )
 
 
-Positions = Mapping[int, Float[Tensor, "3"]]
-"""World points by their id, float64."""
+Positions = Mapping[int, Float[Tensor, "4"]]
+"""World points and their mean reprojection errors (NaN: unknown) by their id, float64."""
 
 
 def _points(reconstruction: Any, file: Path) -> tuple[PointCloud, Positions, int]:
     """Return the finite points of a model, all positions by id, and the number of points left out."""
     numbers = sorted(reconstruction.points3D)
     points = [reconstruction.point3D(number) for number in numbers]
-    positions = _stack([point.xyz for point in points], 3)
+    known = _stack([[*point.xyz, point.error if point.has_error() else math.nan] for point in points], 4)
+    positions = known[:, :3]
     usable = _usable(positions)
     if not usable.any():
         raise InputError(
@@ -120,7 +123,7 @@ def _points(reconstruction: Any, file: Path) -> tuple[PointCloud, Positions, int
         )
     colours = torch.from_numpy(np.array([point.color for point in points]))
     cloud = PointCloud(in_single_where_resolved(positions[usable]), colours[usable])
-    return cloud, dict(zip(numbers, positions, strict=True)), int((~usable).sum())
+    return cloud, dict(zip(numbers, known, strict=True)), int((~usable).sum())
 
 
 def error_words(mean_error: float) -> str:
@@ -196,7 +199,8 @@ def _image(image: Any, positions: Positions | None, file: Path) -> ModelImage:
     if lost and file.suffix.lower() == ".txt":  # a binary file states how many points it has
         raise InputError(f"{file} is truncated: {name} observes its point {lost[0]}; copy or make the model again.")
     keypoints = [point for point in drawn if point.point3D_id in positions]
-    observed = _stack([positions[point.point3D_id] for point in keypoints], 3)
+    known = _stack([positions[point.point3D_id] for point in keypoints], 4)
+    observed = known[:, :3]
     usable, pose = _usable(observed), image.cam_from_world()
     length = pose.rotation.norm()
     if not abs(length - 1) <= QUATERNION_TOLERANCE:
@@ -211,6 +215,7 @@ def _image(image: Any, positions: Positions | None, file: Path) -> ModelImage:
         translation=torch.from_numpy(pose.translation.copy()),
         keypoints=_stack([point.xy for point in keypoints], 2)[usable],
         observed=observed[usable],
+        errors=known[usable, 3],
         lost=len(lost),
     )
 

@@ -29,9 +29,7 @@ def fill_gaps(scene: Scene, count: int, generator: torch.Generator) -> Scene:
         return scene
     positions, colours = (torch.cat(parts) for parts in zip(*clouds, strict=True))
     chosen = torch.randperm(len(positions), generator=generator)[:count]
-    points = PointCloud(
-        torch.cat([scene.points.positions, positions[chosen]]), torch.cat([scene.points.colours, colours[chosen]])
-    )
+    points = scene.points.joined(positions[chosen], colours[chosen])
     note = f"{len(chosen):,} points added to {len(scene.points):,} where training views show none (scene.fill)"
     return replace(scene, points=points, notes=[*scene.notes, note])
 

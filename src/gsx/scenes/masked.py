@@ -65,22 +65,22 @@ def to_stored(mask: Path, turns: Turns, raster: Size) -> tuple[int, ...]:
     return ()
 
 
-def folder_of(options: SceneOptions) -> Path:
+def folder_of(options: SceneOptions, folder: str = FOLDER) -> Path:
     """Return the folder of masks: in the scene's folder, or next to it where that holds photographs itself."""
     path = expand_home(options.path)
-    inside, above = path / FOLDER, path.parent / FOLDER
+    inside, above = path / folder, path.parent / folder
     photographs = options.name == "photos" and not (path / IMAGES).is_dir()
     return above if photographs and not inside.is_dir() else inside
 
 
-def candidates(folder: Path, name: str) -> list[Path]:
+def candidates(folder: Path, name: str, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:
     """Return files that may be the mask of a photograph: NAME.png (COLMAP), NAME, or NAME with another suffix.
 
     They lie below the same folders, or without the first of them.
     """
     parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..")]
     names = dict.fromkeys(PurePosixPath(*parts[first:]) for first in range(min(len(parts), 2)))
-    forms = [(f"{one}.png", str(one), *(str(one.with_suffix(suffix)) for suffix in SUFFIXES)) for one in names]
+    forms = [(f"{one}.png", str(one), *(str(one.with_suffix(suffix)) for suffix in suffixes)) for one in names]
     return [folder / form for several in forms for form in several]
 
 

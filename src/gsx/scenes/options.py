@@ -17,6 +17,8 @@ WORDS = {
     "masks": ("auto", "alpha", "none"),
     "orientation": ("auto", "stored", "turned"),
     "lens": ("undistort", "native"),
+    "depth_values": ("depth", "disparity"),
+    "depth_fit": ("affine", "scale", "none"),
 }
 """Values of options that are words."""
 
@@ -49,6 +51,12 @@ class SceneOptions:
     """Points that are added where training views have none (gsx.scenes.filling)."""
     stereo: Annotated[int, Range(0, 10**8)] = 0
     """Points that are measured by stereo and added (gsx.scenes.stereo)."""
+    depth_values: str = "depth"
+    """Content of depth maps: depth, which is camera z, or disparity, which is 1 / z."""
+    depth_fit: str = "affine"
+    """Fit of each depth map on points of the scene: affine (scale and shift) | scale | none."""
+    depth_unit: Annotated[float, Range(0, 1e9)] = 0.0
+    """Units of the scene's files in a number of a depth map; 0: 0.001 for whole numbers, else 1."""
     disturb: Annotated[dict[str, float], Range(0, 64)] = field(
         default_factory=lambda: {"exposure": 0.0, "shade": 0.0, "pose": 0.0, "blur": 0.0, "covered": 0.0, "some": 1.0}
     )

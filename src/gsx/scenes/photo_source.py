@@ -33,6 +33,8 @@ class PhotoSource:
     """Undistortion or reduction of the decoded file; equal ones compare equal."""
     mask: Mask | None = None
     """Mask of the photograph; None: all pixels count."""
+    depth: Path | None = None
+    """Its depth map, if there is one; it has the photograph's raster, or a reduction of it."""
 
     def image(self, camera: Camera) -> UInt8[Tensor, "3 H W"]:
         """Return the photograph on the raster of `camera`, which is `whole` on any raster, or a crop of that.

@@ -18,6 +18,7 @@ from gsx.core.errors import InputError
 from gsx.core.files import expand_home
 from gsx.core.shapes import Float
 from gsx.lenses import lens_of
+from gsx.scenes.depth_files import depth_file
 from gsx.scenes.duplicates import refuse_shared
 from gsx.scenes.masked import mask_of, masks_named
 from gsx.scenes.options import SceneOptions
@@ -50,6 +51,8 @@ class Shot:
     remap: StoredUndistortion | None = None
     mask: Path | None = None
     """Its mask, if the poses file names one."""
+    depth: Path | None = None
+    """Its depth map, if the poses file names one."""
     turns: Turns = Turns()
     """Turns from the stored photo to the raster of `whole`, and from there upright."""
 
@@ -185,6 +188,7 @@ def _view(shot: Shot, options: SceneOptions, rule: ResizeRule, cache: ImageCache
         expected_size=turns.stored_size(shot.expected_size),
         remap=turns.around(shot.remap),
         mask=mask_of(shot.photo, shot.name, shot.mask, shot.remap, shot.expected_size, options, turns),
+        depth=shot.depth or depth_file(shot.name, options),
     )
     return View(shot.name, oriented_camera(whole.resize(*size), turns.last), source)
 

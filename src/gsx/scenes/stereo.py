@@ -84,11 +84,8 @@ def add_stereo_points(scene: Scene, count: int, generator: torch.Generator) -> S
     note = (
         f"{len(chosen):,} of {len(found):,} points measured by stereo are added to {len(scene.points):,} (scene.stereo)"
     )
-    joined = PointCloud(
-        torch.cat([scene.points.positions, found.positions[chosen].to(scene.points.positions)]),
-        torch.cat([scene.points.colours, found.colours[chosen]]),
-    )
-    return replace(scene, points=joined, notes=[*scene.notes, note])
+    points = scene.points.joined(found.positions[chosen], found.colours[chosen])
+    return replace(scene, points=points, notes=[*scene.notes, note])
 
 
 # -- photos ------------------------------------------------------------------------------------------------------------

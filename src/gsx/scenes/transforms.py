@@ -2,7 +2,7 @@
 
 Poses are camera-to-world with OpenGL axes. Poses and points are used as stored: nerfstudio has already applied its
 `applied_transform` and `applied_scale` to both. Photos with distortion are treated as in COLMAP scenes. Depth maps
-(`depth_file_path`) are not used.
+(`depth_file_path`) are read where `training.depth` uses them.
 """
 
 import reprlib
@@ -80,8 +80,9 @@ def _shot(entry: Mapping[str, Any], photo: Path, file: Path, turns_of: TurnsOf, 
     place = f"Frame '{name}' of '{file}'"
     rotation, translation = pose_from_opengl(entry.get("transform_matrix"), place)
     shot = shot_through(lens_of(entry, photo, place), name, photo, rotation, translation, turns_of, native)
-    mask = entry.get("mask_path")
-    return shot if mask is None else replace(shot, mask=file.parent / plain_name(str(mask)))
+    stated = (entry.get("mask_path"), entry.get("depth_file_path"))
+    mask, depth = (None if path is None else file.parent / plain_name(str(path)) for path in stated)
+    return replace(shot, mask=mask, depth=depth)
 
 
 def _ignored(parts: Sequence[FrameFile]) -> list[str]:

@@ -63,7 +63,7 @@ def fresh(folder: Path, *more: str) -> Run:
 def test_what_is_compared_and_looked_at_is_the_reduced_picture(tmp_path: Path) -> None:
     run = fresh(tmp_path, "training.supersampling.factor=2")
     camera = run.scene.train[0].camera
-    drawn, rendering, finer = render_for_training(run, camera, 1, run.background)
+    drawn, rendering, finer, _ = render_for_training(run, camera, 1, run.background)
     fine = rasterize(drawn.splats, camera.zoom(2), run.raster, background=run.background).image
     assert rendering.screen.size == (96, 72)
     assert finer[0].draws_as(camera.zoom(2))

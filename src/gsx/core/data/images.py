@@ -36,7 +36,7 @@ def read_image(path: str | Path) -> UInt8[Tensor, "C H W"]:
     Raises:
         InputError: the file is missing, damaged, CMYK, or has channels other than grey or RGB and alpha.
     """
-    pixels, spec = _decode(Path(path))
+    pixels, spec = decode(Path(path))
     stated = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 1 or Path(path).suffix.lower() == ".bmp"
     straight = spec.alpha_channel < 0 or stated  # OpenImageIO does not state it for BMP
     if pixels.shape[2] < 3:  # grey, perhaps with alpha
@@ -163,7 +163,7 @@ def open_image(path: Path) -> Any:
     return reader
 
 
-def _decode(path: Path) -> tuple[np.ndarray, Any]:
+def decode(path: Path) -> tuple[np.ndarray, Any]:
     """Returns pixels [H, W, C] in the file's number type, and its description."""
     reader = open_image(path)
     spec = reader.spec()

@@ -1,6 +1,6 @@
 """Scenes as loaders return them: views with images at several resolutions, points, extent, background."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -71,6 +71,17 @@ def file_of(source: ImageSource) -> Path | None:
     return None if path is None else Path(path)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Depths:
+    """Measured depths at places of a view."""
+
+    pixels: Float[Tensor, "K 2"]
+    """Places, px of the view's camera."""
+    z: Float[Tensor, "K"]
+    """Camera z, scene units."""
+    weights: Float[Tensor, "K"]
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """Camera with its image; images are decoded on demand, as uint8."""
@@ -80,6 +91,10 @@ class View:
     source: ImageSource
     group: str = ""
     """Group in reports, such as a BungeeNeRF scale; empty: none."""
+    sparse: Depths | None = None
+    """Depths of the points of structure from motion that it observes; None: unknown."""
+    depth_map: Callable[[], Float[Tensor, "H W"] | None] | None = None
+    """Reads camera z at its pixels, scene units, 0 where unknown, or None: unusable; None: there is no map."""
 
     @property
     def file(self) -> Path | None:
@@ -112,7 +127,7 @@ class View:
         """Returns the view at `factor` times its resolution; None: there is no such image."""
         if factor > self.source.max_zoom(self.camera):
             return None
-        return replace(self, camera=self.camera.zoom(factor))
+        return replace(self, camera=self.camera.zoom(factor), sparse=None, depth_map=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +141,11 @@ class PointCloud:
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    def joined(self, positions: Float[Tensor, "Q 3"], colours: UInt8[Tensor, "Q 3"]) -> "PointCloud":
+        """Returns the cloud with more points after its own."""
+        positions = torch.cat([self.positions, positions.to(self.positions)])
+        return PointCloud(positions, torch.cat([self.colours, colours]))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

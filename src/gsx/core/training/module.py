@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
+from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene, View
 from gsx.core.data.window import Window
-from gsx.core.shapes import Float
+from gsx.core.gaussians.splats import Splats
+from gsx.core.shapes import Bool, Float
 
 if TYPE_CHECKING:
     from gsx.core.training.run import Run
@@ -83,6 +85,27 @@ class TrainingModule:
     def ignored_windows(self, run: "Run", view: View, step: int) -> Sequence[Window]:
         """Returns the windows of a training view that enter no loss at a step."""
         return ()
+
+    def channels(self, run: "Run", splats: Splats, camera: Camera, step: int) -> Float[Tensor, "M K"] | None:
+        """Returns values of each splat that a training render blends as it does colours, over 0; None: none."""
+        return None
+
+    def loss(
+        self,
+        run: "Run",
+        view: View,
+        step: int,
+        camera: Camera,
+        blended: Float[Tensor, "K H W"],
+        counted: Bool[Tensor, "h w"] | None,
+    ) -> Float[Tensor, ""] | None:
+        """Returns a term of a training view's loss, from its blended `channels`; None: the loss stays as it is.
+
+        Args:
+            camera: Camera of the raster of `blended`, which may be finer than the view's.
+            counted: Pixels of the view that enter losses; None: all.
+        """
+        return None
 
     def raster_scale(self, step: int) -> int:
         """Returns the factor by which renders of a step are finer than the photos; they are reduced as photos were."""

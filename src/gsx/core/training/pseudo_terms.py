@@ -56,7 +56,7 @@ def backward_term(run: Run, term: Term, step: int, observations: list[Observatio
     """Runs backward for a term and returns its value; appends the observations of its renders."""
     total = 0.0
     for view, weight in term.parts:
-        drawn, rendering, _ = render_for_training(run, view.camera, step, run.background)
+        drawn, rendering, *_ = render_for_training(run, view.camera, step, run.background)
         loss = weight * difference_from(run, rendering.image, view, term)
         loss.backward()
         total += float(loss.detach())

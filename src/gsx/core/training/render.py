@@ -1,12 +1,15 @@
 """Renders of a run's model: differentiable in a training step, and in bounded memory for pictures."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TypeAlias
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gsx.core.data.camera import Camera
+from gsx.core.data.scene import View
 from gsx.core.gaussians.splats import Gaussians, Splats, splats_of
 from gsx.core.rasterizer import TILE_PIXELS, RasterSettings, Rendering, TiledRendering, rasterize, rasterize_tiled
 from gsx.core.shapes import Bool, Float
@@ -19,19 +22,50 @@ CameraImage: TypeAlias = tuple[Camera, Tensor]
 
 
 def render_for_training(
-    run: Run, camera: Camera, step: int, colour: Float[Tensor, "3"]
-) -> tuple[Drawn, Rendering, CameraImage]:
+    run: Run, camera: Camera, step: int, colour: Float[Tensor, "3"], channels: bool = False
+) -> tuple[Drawn, Rendering, CameraImage, Mapping[str, Tensor]]:
     """Renders what the backbone draws at a step over a background colour.
 
     Returns:
-        What was drawn, its render, and the picture before reduction with its camera. Screen statistics are those of
-        the raster that was drawn; the render's picture is reduced from it.
+        What was drawn, its render, the picture before reduction with its camera, and, with `channels`, those of the
+        modules by name, blended on the same raster. Screen statistics are those of the raster that was drawn; the
+        render's picture is reduced from it.
     """
     raster, absolute = run.views.raster_for(step)(camera), run.backbone.absolute_gradient
     drawn = run.backbone.draw(raster.drawn_for, step)
-    rendering = rasterize(drawn.splats, raster.camera, run.raster, background=colour, absolute_gradient=absolute)
-    image, alpha = (raster.reduced(part) for part in (rendering.image, rendering.alpha[None]))
-    return drawn, replace(rendering, image=image, alpha=alpha[0]), (raster.camera, rendering.image)
+    added = module_channels(run, drawn.splats, raster.camera, step) if channels else {}
+    splats, colours = (drawn.splats, colour) if not added else with_channels(drawn.splats, colour, added)
+    rendering = rasterize(splats, raster.camera, run.raster, background=colours, absolute_gradient=absolute)
+    whole, *blended = rendering.image.split([3, *(v.shape[1] for v in added.values())]) if added else [rendering.image]
+    image, alpha = (raster.reduced(part) for part in (whole, rendering.alpha[None]))
+    named = dict(zip(added, blended, strict=True))
+    return drawn, replace(rendering, image=image, alpha=alpha[0]), (raster.camera, whole), named
+
+
+def module_channels(run: Run, splats: Splats, camera: Camera, step: int) -> dict[str, Float[Tensor, "M _"]]:
+    """Returns the channels of the run's modules by name, without those that have none."""
+    values = {name: module.channels(run, splats, camera, step) for name, module in run.modules.items()}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def with_channels(
+    splats: Splats, colour: Float[Tensor, "3"], added: Mapping[str, Float[Tensor, "M _"]]
+) -> tuple[Splats, Float[Tensor, "C"]]:
+    """Returns splats with more channels after their colours, and the background, which is 0 there."""
+    colours = torch.cat([splats.colours, *added.values()], 1)
+    return replace(splats, colours=colours), pad(colour, (0, colours.shape[1] - len(colour)))
+
+
+def module_losses(
+    run: Run, view: View, step: int, camera: Camera, blended: Mapping[str, Tensor], counted: Bool[Tensor, "H W"] | None
+) -> dict[str, Float[Tensor, ""]]:
+    """Returns the terms of the modules in a training view's loss, by name."""
+    nothing = torch.empty(0, camera.height, camera.width, device=run.device)
+    terms = {
+        name: module.loss(run, view, step, camera, blended.get(name, nothing), counted)
+        for name, module in run.modules.items()
+    }
+    return {name: term for name, term in terms.items() if term is not None}
 
 
 def observe(run: Run, drawn: Drawn, rendering: Rendering, step: int, weight: float) -> Observation:

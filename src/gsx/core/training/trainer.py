@@ -22,7 +22,7 @@ from gsx.core.training.minibatch import accumulate_gradients, merge_gradients, r
 from gsx.core.training.parameter_table import zero_grad
 from gsx.core.training.pseudo_terms import backward_terms, request_terms, reusable_parts, reused_losses, without_windows
 from gsx.core.training.pseudo_views import Term
-from gsx.core.training.render import observe, render_for_training
+from gsx.core.training.render import module_losses, observe, render_for_training
 from gsx.core.training.run import Run, StepResult
 
 logger = logging.getLogger(__name__)
@@ -135,7 +135,7 @@ def view_loss(run: Run, step: int, view: View, terms: Sequence[Term], colour: Fl
     divided = [reusable_parts(term, cameras, run.training.random_background) for term in allowed]
     parts = backward_terms(run, [term for term, _ in divided], step, observations)
     own = 1 - sum(term.replaces for term in terms)
-    drawn, rendering, finer = render_for_training(run, view.camera, step, colour)
+    drawn, rendering, finer, blended = render_for_training(run, view.camera, step, colour, channels=True)
     backend = run.raster.backend.on(run.device.type, learning=True)
     matched = run.views.match_photo(rendering.image, target, view, learning=True)
     moments = run.photos.moments_of(view, target, backend) if counted is None else None
@@ -144,8 +144,10 @@ def view_loss(run: Run, step: int, view: View, terms: Sequence[Term], colour: Fl
     if extra is not None:
         loss = loss + extra
     loss = loss if own == 1 else own * loss
-    named = {"own": float(loss.detach())} | parts if parts else {}
-    for name, value in reused_losses(run, [(view.camera, rendering.image), finer], divided):
+    added = module_losses(run, view, step, finer[0], blended, counted)
+    named = {"own": float(loss.detach())} | parts | dict.fromkeys(added, 0.0) if parts or added else {}
+    reused_terms = reused_losses(run, [(view.camera, rendering.image), finer], divided)
+    for name, value in [*added.items(), *reused_terms]:
         named[name] += float(value.detach())
         loss = loss + value
     loss.backward()

@@ -31,6 +31,10 @@ UNCHANGED = {
     "scene.lens": "undistort",
     "scene.fisheye": 0.0,
     "scene.stereo": 0,
+    "scene.depth_maps": False,
+    "scene.depth_values": "depth",
+    "scene.depth_fit": "affine",
+    "scene.depth_unit": 0.0,
     "scene.rooms": 1,
     "scene.block": "",
     "scene.block_margin": 0.2,
@@ -47,6 +51,7 @@ UNCHANGED = {
 """Keys newer than the first digests, with their neutral values, which do not count."""
 WITHOUT_EFFECT: dict[str, dict[str, Any]] = {
     "training.deadline": {"seconds": 0.0, "steps": 0, "planned": [], "start": 0.2, "to": 0.8, "skip": []},
+    "training.depth": {"when": "never"},
     "backbone.mcmc": {"primitives": 0},
 }
 """Nodes newer than the first digests, with values by which they change nothing and do not count."""

@@ -17,7 +17,9 @@ from gsx.experiments.evaluation.remarks import NOT_MEASURED
 from gsx.experiments.runs.degraded import degrade
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.origin import Origin
+from gsx.modules.depth import DepthOptions, prepare_scene
 from gsx.scenes.blocks import BlockChoice, block_of, parsed_block
+from gsx.scenes.depth_files import with_depth_maps
 from gsx.scenes.filling import fill_gaps
 from gsx.scenes.origin import around_origin, origin_of
 from gsx.scenes.posed import SAME_PLACE
@@ -53,7 +55,7 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
             f"all {len(scene.train)} training cameras of scene '{scene.name}' stand at one place, and no points lie "
             "elsewhere, so depth and scale are unknown: use photos from different places"
         )
-    scene = part_of(scene, options)
+    scene = with_depth_maps(part_of(scene, options), options)
     if count := getattr(options, "fill", 0):
         generator = torch.Generator().manual_seed(derived_seed("fill", settings.general.seed))
         scene = fill_gaps(scene, count, generator)
@@ -61,6 +63,9 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
     if (count := getattr(options, "stereo", 0)) and len(scene.points):
         generator = torch.Generator().manual_seed(derived_seed("stereo", settings.general.seed))
         scene = add_stereo_points(scene, count, generator)
+    if (chosen := settings.modules.get("depth")) and isinstance(chosen.options, DepthOptions):
+        generator = torch.Generator().manual_seed(derived_seed("depth points", settings.general.seed))
+        scene = prepare_scene(scene, chosen.options, generator)
     return scene
 
 
@@ -166,7 +171,8 @@ def in_units(scene: Scene, unit: float) -> Scene:
         return scene
 
     def rescaled(view: View) -> View:
-        return replace(view, camera=replace(view.camera, translation=view.camera.translation * unit))
+        sparse = view.sparse and replace(view.sparse, z=view.sparse.z * unit)
+        return replace(view, camera=replace(view.camera, translation=view.camera.translation * unit), sparse=sparse)
 
     return replace(
         scene,

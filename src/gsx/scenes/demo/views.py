@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,7 +20,7 @@ from gsx.core.shapes import Float, UInt8
 from gsx.engine.cache import cache_folder, content_key
 from gsx.engine.cached_images import cache_image, read_cached_image
 from gsx.scenes.demo.cameras import DISTANCES, Cameras, even_cameras, mixed_cameras, spiral_camera
-from gsx.scenes.demo.fisheye import straightened, through_fisheye
+from gsx.scenes.demo.fisheye import StraightenedSource, straightened, through_fisheye
 from gsx.scenes.demo.passer_by import with_passer_by
 from gsx.scenes.demo.still_life import StillLife, make_still_life
 from gsx.scenes.demo.tracing import colours_of, depth_of, points_at, render
@@ -51,6 +51,8 @@ class RayCastOptions(SceneOptions):
     """Seed of the initial points."""
     passer_by: bool = False
     """A person stands before each training camera. The default: runs older than this option."""
+    depth_maps: bool = False
+    """Training views have exact depth maps. The default: runs older than this option."""
     fisheye: Annotated[float, Range(0, 170)] = 0.0
     """Horizontal angle of view of a fisheye for all cameras, degrees; 0: pinholes. `lens` decides its use."""
 
@@ -101,6 +103,13 @@ class DemoSource:
         made = render(self.life, camera, self.samples)
         cache_image(path, made)
         return made
+
+
+def with_depth(view: View) -> View:
+    """Return a view with its exact depth map, 0 in the sky."""
+    source = view.source.source if isinstance(view.source, StraightenedSource) else view.source
+    assert isinstance(source, DemoSource)
+    return replace(view, depth_map=lambda: source.exact_depth(view.camera).nan_to_num(posinf=0.0))
 
 
 def same_view(camera: Camera, own: Camera) -> bool:
@@ -210,6 +219,8 @@ def scene_of(
     made_of = points(life, train, options.points, torch.Generator().manual_seed(options.seed))
     if options.fisheye and options.lens == "undistort":
         train_views, test_views = (straightened(views, cache) for views in (train_views, test_views))
+    if options.depth_maps:
+        train_views = [with_depth(view) for view in train_views]
     return Scene(
         name=options.name,
         train=[*train_views, *test_views] if every else train_views,
