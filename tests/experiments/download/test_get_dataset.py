@@ -88,6 +88,7 @@ class Server:
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     """A server of one file on this machine; attempts follow each other at once."""
     monkeypatch.setattr(receive, "PAUSES", (0.0, 0.0, 0.0))
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
     state = Server()
 
     class Handler(BaseHTTPRequestHandler):
@@ -177,9 +178,17 @@ def test_a_file_that_changed_between_calls_is_fetched_anew(server: Server, tmp_p
     server.cuts, archive = [100_000, 0, 0, 0, 0], archive_of(server)
     with pytest.raises(InputError):
         fetch(archive, tmp_path)
-    server.content, server.tag = zipped(FILES | {"set/berlin/images/b.jpg": b"new"}), '"two"' if honest else '"one"'
+    server.content, server.tag = zipped({"first": b"new"} | FILES), '"two"' if honest else '"one"'
     fetch(archive, tmp_path)
     assert (tmp_path / "set.zip").read_bytes() == server.content
+    assert server.requests[5:] == (["bytes=100000-"] if honest else ["bytes=100000-", ""])
+
+
+def test_a_call_that_ended_before_the_check_is_not_repeated(server: Server, tmp_path: Path) -> None:
+    receive.Download(server.url, tmp_path / "set.zip").run()
+    fetch(archive_of(server), tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["set.zip", "set.zip.sha256"]
+    assert server.requests == [""]
 
 
 def test_checksums_are_compared(server: Server, tmp_path: Path) -> None:

@@ -68,9 +68,9 @@ def lacking_of(dataset: Dataset, root: Path, scenes: Sequence[str]) -> list[str]
 
 
 def due_of(dataset: Dataset, folder: Path, lacking: Sequence[str]) -> list[Due]:
-    """Choose archives for scenes, first those that are here; those by hand count only if they are."""
+    """Choose archives for scenes, in their order; those without an address count only if they are here."""
     due, left = list[Due](), list(lacking)
-    for archive in sorted(dataset.archives, key=lambda each: not (folder / each.file).is_file()):
+    for archive in dataset.archives:
         taken = [scene for scene in left if scene in archive.scenes]
         if taken and (archive.url or (folder / archive.file).is_file()):
             due.append((archive, taken))

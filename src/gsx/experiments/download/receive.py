@@ -39,14 +39,21 @@ class Interrupted(InputError):
 
 @dataclass(frozen=True)
 class Offer:
-    """A server's answer: version of the file, and first byte of the answer in it."""
+    """A version of a file, and a position in it."""
 
     url: str
     size: int
-    """Bytes of the whole file."""
+    """Bytes of the whole file; -1: unknown."""
     tag: str
     """ETag or time of last change, for If-Range; empty: the server states neither."""
     start: int = 0
+    """First byte of a server's answer, or number of bytes that are here."""
+
+    def range(self) -> dict[str, str]:
+        """Return the headers that ask for the rest of the file, if it has not changed."""
+        if not self.start:
+            return {}
+        return {"Range": f"bytes={self.start}-"} | ({"If-Range": self.tag} if self.tag else {})
 
 
 def offer_of(response: HTTPResponse, url: str) -> Offer:
@@ -92,21 +99,17 @@ class Download:
         self.part = file.with_name(f"{file.name}.part")
         self.state = file.with_name(f"{file.name}.part.json")
 
-    def received(self) -> int:
-        """Return the number of bytes that are here."""
-        return self.part.stat().st_size if self.part.is_file() else 0
-
-    def known(self) -> Offer | None:
-        """Return the version of the bytes that are here; None: there are none, or of another address."""
+    def here(self) -> Offer:
+        """Return the version of the bytes that are here, and their number."""
         with suppress(OSError, ValueError, TypeError):
-            offer = Offer(**read_json(self.state))
-            return offer if self.received() and offer.url == self.url else None
-        return None
+            offer = Offer(**read_json(self.state), start=self.part.stat().st_size)
+            if offer.url == self.url:
+                return offer
+        return Offer(self.url, -1, "")
 
     def complete(self) -> bool:
         """Return whether all bytes are here."""
-        known = self.known()
-        return known is not None and known.size == self.received()
+        return self.here().start == self.here().size
 
     def discard(self) -> None:
         """Delete the bytes that are here."""
@@ -125,7 +128,7 @@ class Download:
             idle = 0 if progress else idle + 1
             if idle > len(PAUSES):
                 raise InputError(
-                    f"{self.url}: no progress in {idle} attempts, {amount(self.received())} are here: repeat the "
+                    f"{self.url}: no progress in {idle} attempts, {amount(self.here().start)} are here: repeat the "
                     "command later, it continues where the server allows it"
                 )
             time.sleep(PAUSES[max(0, idle - 1)])
@@ -134,43 +137,31 @@ class Download:
 
     def attempt(self, first: bool) -> bool:
         """Receive until the end or a cut; return whether that made progress. `first`: raise without an answer."""
-        before = self.received() if self.known() else 0
+        here = self.here()
         try:
-            with opened(self.url, self.range_of(before)) as response:
+            with opened(self.url, here.range()) as response:
                 offer = offer_of(response, self.url)
-                if self.continues(offer, before):
-                    self.write(response, offer, before)
+                if offer in (here, replace(offer, start=0)):
+                    self.write(response, offer, here.start)
+                else:
+                    self.discard()
         except Interrupted:
             if first:
                 raise
             return False
-        return offer.start == before < self.received()
-
-    def range_of(self, before: int) -> dict[str, str]:
-        """Return the headers that ask for the rest of the file, if it has not changed."""
-        known = self.known()
-        if known is None:
-            return {}
-        return {"Range": f"bytes={before}-"} | ({"If-Range": known.tag} if known.tag else {})
-
-    def continues(self, offer: Offer, before: int) -> bool:
-        """Return whether an answer starts the file or continues what is here; delete what is here if it does not."""
-        known = self.known()
-        if not offer.start or (known and offer.start == before and (offer.size, offer.tag) == (known.size, known.tag)):
-            return True
-        self.discard()
-        return False
+        return offer.start == here.start < self.here().start
 
     def write(self, response: HTTPResponse, offer: Offer, before: int) -> None:
-        """Append an answer to what is here, or write it anew."""
-        left = offer.size - offer.start
-        refuse_small_disk(self.file.parent, left - (0 if offer.start else before), self.file.name)
-        again = "the server cannot continue, or the file has changed: from the start, " if before > offer.start else ""
-        here = f", {amount(offer.start)} are here" if offer.start else ""
-        logger.info("%s: %s%s%s", self.file.name, again, amount(offer.size), here)
-        progress, done = Countdown("fetching", left), offer.start
-        with self.part.open("ab" if offer.start else "wb") as stream:
-            write_json(self.state, vars(replace(offer, start=0)))
+        """Append an answer to the `before` bytes that are here, or replace them."""
+        left, done = offer.size - offer.start, offer.start
+        refuse_small_disk(self.file.parent, offer.size - before, self.file.name)
+        again = "the server cannot continue, or the file has changed: from the start, " if before > done else ""
+        logger.info(
+            "%s: %s%s%s", self.file.name, again, amount(offer.size), f", {amount(done)} are here" if done else ""
+        )
+        progress = Countdown("fetching", left)
+        with self.part.open("ab" if done else "wb") as stream:
+            write_json(self.state, {"url": offer.url, "size": offer.size, "tag": offer.tag})
             for piece in pieces(response):
                 stream.write(piece)
                 done += len(piece)
