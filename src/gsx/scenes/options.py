@@ -67,7 +67,7 @@ class SceneOptions:
     """Width of the zone around a block's cell whose cameras are used, as a share of its cameras' box."""
     block_share: Share = 0.25
     """Share of the cell's points that a camera outside of that zone must show to be used."""
-    cache_gb: Gigabytes = without_effect(default=2.0)
+    cache_gb: Gigabytes = without_effect(default=1.0)
     """Memory for decoded images, in 10^9 bytes; the least recently used ones are dropped."""
     missing: Share = without_effect(default=0.1)
     """Share of the images that may be absent or unreadable; more are refused."""

@@ -134,7 +134,7 @@ def test_a_composition_is_named_by_what_is_trained_alone() -> None:
         plain = key()
         for words in (["output=elsewhere", "device=cpu", "init=warm_start", "warm_start_at=[3]", "eval.zoom=[1,2]"],
                       ["reuse=true", "training.log_every=3", "regenerator/upscale=lanczos", "length=900",
-                       "scene.cache_gb=1"]):  # fmt: skip
+                       "scene.cache_gb=2"]):  # fmt: skip
             assert key(*words) == plain, words
         for word in ("seed=1", "iterations=901", "backbone=scaffold", "augmenter=upscale", "scene.samples=7",
                      "rasterizer.tile_size=16", "training.ssim_weight=0.1"):  # fmt: skip
