@@ -1,6 +1,7 @@
 """Depth maps of photographs: files of each kind, their units and shapes, and their fit to points, by hand and exact."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from synthetic_colmap import colmap_options, synthesize, write_scene
 from test_transforms import frame_changes, options, write
 from torch import Tensor
 
+from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Scene, View
-from gsx.scenes.colmap import ColmapOptions, load
+from gsx.scenes.colmap import ColmapOptions, depths_of, load
+from gsx.scenes.colmap_model import read_model
 from gsx.scenes.depth_files import FEWEST, fitted, robust_line, straightened, with_depth_maps
 from gsx.scenes.orientation import Turned
 from gsx.scenes.transforms import load as load_transforms
@@ -105,6 +108,29 @@ def test_observed_points_count_by_their_errors(tmp_path: Path) -> None:
     unknown = opened(tmp_path / "unknown")[0].sparse
     assert unknown is not None
     assert set(unknown.weights.tolist()) == {1.0}
+
+
+def test_maps_are_fitted_to_all_points_in_front_where_observations_are_unknown(folder: Path) -> None:
+    """Against the sphere: the map of its front is found, though half of the points lie on its back."""
+    chosen = colmap_options(folder, split="none")
+    view = opened(folder)[0]
+    image = next(one for one in read_model(folder / "sparse/0").images if one.name == view.name)
+    none = replace(image, observed=image.observed[:0], errors=image.errors[:0], keypoints=image.keypoints[:0])
+    assert depths_of(view, none) is None
+    front = sphere(view.camera)
+    store(folder / "depths" / f"{view.name}.npy", torch.where(front > 0, 0.5 * front + 0.1, 0.0).numpy())
+    scene = load(chosen)
+    found = map_of(views_of(replace(scene, train=[replace(one, sparse=None) for one in scene.train]), chosen)[0])
+    torch.testing.assert_close(found, front.float(), rtol=0.02, atol=0)
+
+
+def sphere(camera: Camera) -> Tensor:
+    """z of the front of the unit sphere at the pixels of a camera: the smaller root of |c + z d| = 1; 0 outside."""
+    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    rays = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1).double()
+    square, along = rays.square().sum(-1), rays @ camera.rotation.double() @ camera.centre.double()
+    root = along.square() - square * (float(camera.centre.double().square().sum()) - 1)
+    return torch.where(root > 0, (-along - root.clamp_min(0).sqrt()) / square, 0.0)
 
 
 @pytest.mark.parametrize("name", ["{}.npy", "{stem}.exr", "{stem}.png", "{}.png"])

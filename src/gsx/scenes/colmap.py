@@ -112,11 +112,13 @@ def build(
     return scene_of(options, path, views, sides, model.points, notes, details)
 
 
-def depths_of(view: View, image: ModelImage) -> Depths:
-    """Return the depths of the points that a view observes, weighted by their reprojection errors e.
+def depths_of(view: View, image: ModelImage) -> Depths | None:
+    """Return the depths of the points that a view observes, weighted by their reprojection errors e; None: unknown.
 
     Weights are exp(-(e / mean e)^2), as in DS-NeRF (Deng et al. 2022, load_llff.py), and 1 where e is unknown.
     """
+    if not len(image.observed):
+        return None
     pixels, z = (values.float() for values in view.camera.project(image.observed))
     used, mean = view.camera.shows(pixels, z), image.errors.nanmean().clamp_min(torch.finfo(torch.float32).tiny)
     weights = (-(image.errors / mean).square()).exp().nan_to_num(1.0).float()

@@ -30,6 +30,8 @@ MILLIMETRE = 0.001
 """Unit of whole numbers, m (nerfstudio, depth_unit_scale_factor)."""
 MOST_POINTS = 2000
 """Most points of unknown visibility that a map is fitted to."""
+STRICTLY_BEHIND = 1.05
+"""Such a point is hidden if it is this many times as far as its nearest neighbour in the picture."""
 FEWEST = 10
 """Fewest points on a map that it is fitted to."""
 ROUNDS, LEAST = 50, 1e-4
@@ -146,7 +148,7 @@ def depths_of_points(view: View, points: PointCloud) -> tuple[Float[Tensor, "K 2
     if view.sparse is not None:
         return view.sparse.pixels, view.sparse.z
     pixels, z = (values[:: -(-len(values) // MOST_POINTS) or 1] for values in in_view(view.camera, points.positions))
-    front = in_front(pixels, z) if len(z) else z > 0
+    front = in_front(pixels, z, STRICTLY_BEHIND) if len(z) else z > 0
     return pixels[front], z[front]
 
 

@@ -68,10 +68,10 @@ def in_view(camera: Camera, positions: Float[Tensor, "P 3"]) -> tuple[Float[Tens
     return pixels[inside], depths[inside]
 
 
-def in_front(pixels: Float[Tensor, "M 2"], depths: Float[Tensor, "M"]) -> Bool[Tensor, "M"]:
-    """Return which points are not hidden: not much farther than their neighbours in the picture."""
+def in_front(pixels: Float[Tensor, "M 2"], depths: Float[Tensor, "M"], behind: float = BEHIND) -> Bool[Tensor, "M"]:
+    """Return which points are not hidden: less than `behind` times as far as their neighbours in the picture."""
     _, nearest = nearest_of(pixels, pixels, min(COVERED, len(pixels)))
-    return depths <= BEHIND * depths[nearest].amin(1)
+    return depths <= behind * depths[nearest].amin(1)
 
 
 def nearest_of(
