@@ -37,6 +37,8 @@ COMMON = (
 )
 ON = "training.depth.when=auto"
 EVALUATION = ("eval.zoom=[1,2,4]", "eval.pairs=0", "eval.competitor=null", "eval.flight=false", "metrics.perceptual=[]")
+AS_TRAINED = "eval.supersample=2"
+"""Evaluation of a splat file as of a run that ends with supersampling (conf/backbone/gs3d_zoom.yaml)."""
 ARMS = {
     "without": (),
     "loss": (ON, "training.depth.points=0"),
@@ -92,7 +94,16 @@ def from_folder(scene: str, words: Sequence[str], base: Path) -> Figures:
     trained = train(base / "network", [*own, colour, *words, ON])
     told = base / "network_evaluation"
     if not (told / "evaluation.json").is_file():
-        gsx(["eval", str(base / "network" / "point_cloud.ply"), *SCENES[scene], *EVALUATION, f"folder={told}"])
+        gsx(
+            [
+                "eval",
+                str(base / "network" / "point_cloud.ply"),
+                *SCENES[scene],
+                *EVALUATION,
+                AS_TRAINED,
+                f"folder={told}",
+            ]
+        )
     return figures(read_json(told / "evaluation.json")) | {"seconds": trained["train_seconds"]}
 
 
