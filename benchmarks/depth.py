@@ -38,7 +38,7 @@ COMMON = (
 ON = "training.depth.when=auto"
 EVALUATION = ("eval.zoom=[1,2,4]", "eval.pairs=0", "eval.competitor=null", "eval.flight=false", "metrics.perceptual=[]")
 AS_TRAINED = "eval.supersample=2"
-"""Evaluation of a splat file as of a run that ends with supersampling (conf/backbone/gs3d_zoom.yaml)."""
+"""Evaluation of a splat file as of a run that ends with supersampling (conf/preset/zoom.yaml)."""
 ARMS = {
     "without": (),
     "loss": (ON, "training.depth.points=0"),
