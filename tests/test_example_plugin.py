@@ -173,28 +173,28 @@ def test_a_training_module_of_its_own_trains_resumes_and_reports(
 ) -> None:
     """Codes are learnt; a run that was stopped ends with the same bits; log and report have its lines."""
     often = ("training.log_every=1", "training.checkpoint_every=8", "training.checkpoints_kept=9")
-    chosen = ("module=[appearance]", "training.appearance.size=3", "iterations=16", *often, *FEW)
+    chosen = ("module=[tint]", "training.tint.size=3", "iterations=16", *often, *FEW)
     once, halves = tmp_path / "once", tmp_path / "halves"
     assert main(words(once, *chosen)) == 0
-    remark = "appearance codes of photos have a spread of"
+    remark = "tints of photos have a spread of"
     assert remark in capsys.readouterr().err
     assert remark in (once / "report.html").read_text()
     lines = [json.loads(line) for line in (once / "metrics.jsonl").read_text().splitlines()]
-    spreads = [line["appearance"] for line in lines]
+    spreads = [line["tint"] for line in lines]
     assert spreads[0] == 0 < spreads[8] < spreads[-1]
-    assert json.loads((once / "evaluation.json").read_text())["appearance"] == {"spread": spreads[-1]}
+    assert json.loads((once / "evaluation.json").read_text())["tint"] == {"spread": spreads[-1]}
     shutil.copytree(once, halves)
     for path in (halves / "checkpoints").glob("step_0000016.*"):
         path.unlink()
     assert main(["resume", str(halves)]) == 0
     last = [load_file(folder / "checkpoints" / "step_0000016.safetensors") for folder in (once, halves)]
-    assert last[0]["appearance.codes"].shape == (6, 3)
+    assert last[0]["tint.codes"].shape == (6, 3)
     assert all(torch.equal(last[0][key], last[1][key]) for key in last[0])
 
 
 @pytest.mark.usefixtures("installed")
 def test_options_of_its_module_are_checked(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["module=[appearence]"]) == 2
-    assert "Did you mean 'appearance'?" in capsys.readouterr().err
-    assert main(["module=[appearance]", "training.appearance.sise=3"]) == 2
-    assert "training.appearance.size" in capsys.readouterr().err
+    assert main(["module=[tints]"]) == 2
+    assert "Did you mean 'tint'?" in capsys.readouterr().err
+    assert main(["module=[tint]", "training.tint.sise=3"]) == 2
+    assert "training.tint.size" in capsys.readouterr().err

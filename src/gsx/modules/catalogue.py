@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from gsx.core.training.module import TrainingModule
+from gsx.modules.appearance import Appearance, AppearanceOptions
 from gsx.modules.blur import Blur, BlurOptions
 from gsx.modules.coarse_to_fine import CoarseToFine, CoarseToFineOptions
 from gsx.modules.deadline import Deadline, DeadlineOptions
@@ -22,6 +23,7 @@ MODULES: Mapping[str, tuple[type[TrainingModule], type]] = {
     "trial": (Trial, TrialOptions),
     "poses": (Poses, PoseOptions),
     "exposure": (Exposure, ExposureOptions),
+    "appearance": (Appearance, AppearanceOptions),
     "blur": (Blur, BlurOptions),
     "distractors": (Distractors, DistractorOptions),
     "depth": (Depth, DepthOptions),

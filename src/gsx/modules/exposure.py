@@ -25,6 +25,7 @@ from gsx.core.shapes import Float
 from gsx.core.training.module import ModuleContext
 from gsx.core.training.run import Run
 from gsx.core.training.schedule import log_linear
+from gsx.core.training.training_views import TrainingViews
 from gsx.modules.bilateral_grid import WHOLE, Edges, apply_grid, initial_grids, light_slopes, without_common
 from gsx.modules.corrections import WHEN, Correction, CorrectionOptions, ViewCount, log_test, percent, sample
 from gsx.modules.photo_pairs import LIGHT, Pair, log_gains, render_reduced, shared_spread, usable_pixels
@@ -203,8 +204,7 @@ class Exposure(Correction):
         if self.matrices is None:
             return image
         edges = WHOLE if window is None else window.shares(*view.camera.size)
-        exposed = self.expose(image, self.indices[view.name], learning, edges)
-        return exposed if photo is None else torch.where((photo >= 1) & (exposed > 1), photo, exposed)
+        return within_range(self.expose(image, self.indices[view.name], learning, edges), photo)
 
     def expose(self, image: Tensor, index: int, learning: bool = False, edges: Edges = WHOLE) -> Tensor:
         """Returns the render [3 H W], or its part between these edges, at the exposure of a photo."""
@@ -294,10 +294,18 @@ class Exposure(Correction):
             )
 
 
-def photo_pair(run: Run, view: View) -> Pair:
-    """Returns a reduced render at its photo's exposure, the photo, and the pixels that count and are not saturated."""
+def within_range(image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"] | None) -> Float[Tensor, "3 H W"]:
+    """Returns a render to compare with its photo: the photo where that is saturated and the render brighter."""
+    return image if photo is None else torch.where((photo >= 1) & (image > 1), photo, image)
+
+
+def photo_pair(run: Run, view: View, views: TrainingViews | None = None) -> Pair:
+    """Returns a reduced render as its photo, the photo, and the pixels that count and are not saturated.
+
+    views: whose corrections the render gets; None: the run's.
+    """
     small, rendering = render_reduced(run, view, depth=False)
-    image = run.views.match_photo(rendering.image, None, small).detach().cpu()
+    image = (views or run.views).match_photo(rendering.image, None, small).detach().cpu()
     below, mask = (rendering.image < LIGHT).all(0), small.counted()
     return image, small.image(), below if mask is None else below & mask
 

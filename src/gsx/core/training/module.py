@@ -82,6 +82,15 @@ class TrainingModule:
         """
         return image
 
+    def fit_render(
+        self, image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"], fitted: Bool[Tensor, "H W"]
+    ) -> Float[Tensor, "3 H W"] | None:
+        """Returns the render of a held-out view, corrected as fits these pixels of its photo best.
+
+        It must not use any other pixel of the photo. None: the module does not correct held-out views.
+        """
+        return None
+
     def ignored_windows(self, run: "Run", view: View, step: int) -> Sequence[Window]:
         """Returns the windows of a training view that enter no loss at a step."""
         return ()

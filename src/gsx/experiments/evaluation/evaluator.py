@@ -27,6 +27,7 @@ from gsx.experiments.evaluation.competitor import Competitor
 from gsx.experiments.evaluation.cross_view import CrossViews
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluated_renders import EvaluatedRenders
+from gsx.experiments.evaluation.fitted_views import fitted_figures, fitted_summary
 from gsx.experiments.evaluation.lpips import load_lpips
 from gsx.experiments.evaluation.perceptual import MetricSettings, at_training_size, load_metrics
 from gsx.experiments.evaluation.protocol import protocol_of
@@ -63,6 +64,11 @@ def group_figures(views: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     """Returns means over the views of a group."""
     keys = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips", "visible_primitives": "visible"}
     return {name: mean([view[key] for view in views]) for name, key in keys.items()}
+
+
+def view_entry(view: dict[str, Any], figures: Sequence[str]) -> dict[str, Any]:
+    """Returns a view's entry in evaluation.json."""
+    return {key: view[key] for key in ("name", "group", *figures, "perceptual")} | view["surface"] | view["fitted"]
 
 
 def metric_settings(run: Run, options: EvalOptions) -> MetricSettings:
@@ -109,6 +115,7 @@ class Evaluator:
             "lpips": None if self.lpips is None else self.lpips.distance(*parts),
             "perceptual": self.perceptual.view(*parts),
             "surface": self.renders.surface_errors(view, evaluated),
+            "fitted": fitted_figures(self.run, view, tiled.image, self.options),
             "visible": int(tiled.visible.sum()),
             "left_out": tiled.dropped,
         }
@@ -225,6 +232,7 @@ class Evaluator:
             "visible_primitives": mean([v["visible"] for v in views]),
             "left_out": mean([v["left_out"] for v in views]),
             **surface_summary(views),
+            **fitted_summary(views),
             **gathered(curves),
             **module_summaries(run),
             "megabytes": size / 1e6,
@@ -237,7 +245,7 @@ class Evaluator:
             "groups": {name: group_figures(vs) | self.perceptual.summary(vs) for name, vs in by_group.items()},
             **({"competitor": self.competitor.provenance()} if self.competitor else {}),
             "zoom": self.zooms(views, drawing, advance),
-            "views": [{key: v[key] for key in ("name", "group", *figures, "perceptual")} | v["surface"] for v in views],
+            "views": [view_entry(v, figures) for v in views],
         }
         return evaluation | module_remarks(run, evaluation)
 

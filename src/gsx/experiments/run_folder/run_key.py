@@ -53,6 +53,7 @@ WITHOUT_EFFECT: dict[str, dict[str, Any]] = {
     "training.deadline": {"seconds": 0.0, "steps": 0, "planned": [], "start": 0.2, "to": 0.8, "skip": []},
     "training.depth": {"when": "never"},
     "backbone.mcmc": {"primitives": 0},
+    "training.appearance": {"when": "never"},
 }
 """Nodes newer than the first digests, with values by which they change nothing and do not count."""
 TRIAL = "training.trial"

@@ -1,4 +1,4 @@
-"""A training module of a third party: one appearance code per photo, decoded to a colour matrix (after NeRF-W)."""
+"""A training module of a third party: one tint per photo, a code that is decoded to a colour matrix."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,22 +14,22 @@ from gsx.core.training.module import ModuleContext
 
 
 @dataclass(frozen=True, kw_only=True)
-class AppearanceOptions:
+class TintOptions:
     size: int = 4
     """Numbers in a code."""
     rate: float = 0.005
     """Learning rate of Adam."""
 
 
-class Appearance(LearnedModule):
-    def __init__(self, options: AppearanceOptions, context: ModuleContext) -> None:
+class Tint(LearnedModule):
+    def __init__(self, options: TintOptions, context: ModuleContext) -> None:
         photos, generator = [view.name for view in context.scene.train], torch.Generator().manual_seed(0)
         self.index = {name: number for number, name in enumerate(photos)}
         codes, decoder = torch.zeros(len(photos), options.size), torch.randn(12, options.size, generator=generator)
         super().__init__(options, context, options.rate, codes=codes, decoder=decoder)
 
     def before_step(self, run: Any) -> dict[str, float]:
-        return {"appearance": float(self.learned["codes"].detach().std())}
+        return {"tint": float(self.learned["codes"].detach().std())}
 
     def transform_render(self, image: Tensor, view: Any, photo: Any, window: Any, learning: bool) -> Tensor:
         code = self.learned["decoder"] @ self.learned["codes"][self.index[view.name]]
@@ -38,20 +38,20 @@ class Appearance(LearnedModule):
 
     @classmethod
     def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        spreads = [line["appearance"] for line in lines if "appearance" in line]
-        return {"appearance": {"spread": spreads[-1]}} if spreads else {}
+        spreads = [line["tint"] for line in lines if "tint" in line]
+        return {"tint": {"spread": spreads[-1]}} if spreads else {}
 
     @classmethod
     def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
-        if "appearance" in evaluation:
-            yield f"appearance codes of photos have a spread of {evaluation['appearance']['spread']:.3f}"
+        if "tint" in evaluation:
+            yield f"tints of photos have a spread of {evaluation['tint']['spread']:.3f}"
 
 
 @hookimpl
 def gsx_register(registry: Registry) -> None:
-    registry.add("module", "appearance", Appearance, AppearanceOptions)
+    registry.add("module", "tint", Tint, TintOptions)
 
 
 @hookimpl
 def gsx_config_paths() -> list[str]:
-    return ["pkg://gsx_appearance.conf"]
+    return ["pkg://gsx_tint.conf"]

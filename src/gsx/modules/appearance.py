@@ -1,0 +1,227 @@
+"""Appearance of each photo: a small code, decoded to exposure, white balance and light across the photo.
+
+NeRF in the Wild (Martin-Brualla et al. 2021) learns a code per photo and a network that decodes it. Ours: codes are
+principal components of measured responses (`colour_response`), so few numbers hold what differs among these photos;
+codes and decoder then learn with the model, by Adam. The mean code stays 0, the neutral one, which novel views have.
+The code of a held-out view is fitted to a part of its photo, for figures next to those of the neutral one.
+"""
+
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from gsx.core.data.scene import View
+from gsx.core.data.window import Window
+from gsx.core.ranges import Range
+from gsx.core.shapes import Bool, Float
+from gsx.core.training.module import ModuleContext
+from gsx.core.training.run import Run
+from gsx.core.training.schedule import log_linear
+from gsx.modules.bilateral_grid import WHOLE
+from gsx.modules.colour_response import NUMBERS, fit_code, light_fields, principal_codes, respond
+from gsx.modules.corrections import Correction, CorrectionOptions, Times, ViewCount, log_test, percent, sample
+from gsx.modules.exposure import (
+    EQUAL,
+    PositiveRate,
+    adam_direction,
+    light_of,
+    photo_pair,
+    spreads_of,
+    within_range,
+)
+from gsx.modules.photo_pairs import Pair, usable_pixels
+
+logger = logging.getLogger(__name__)
+
+PRIOR = 0.3
+"""Standard deviation of the numbers of a photo before it is measured."""
+LEAST_SPREAD = 1e-4
+"""Least standard deviation of codes in the prior of a held-out view's code."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AppearanceOptions(CorrectionOptions):
+    """Options; values in conf/module/appearance.yaml."""
+
+    key: ClassVar[str] = "appearance"
+    times: Times = 1
+    """Number of estimates; each restarts learning."""
+    size: Annotated[int, Range(1, NUMBERS)] = 8
+    """Numbers in a code; fewer where photos are fewer."""
+    spread: Annotated[float, Range(0, 1)] = 0.06
+    """`auto`: standard deviation of log gains above which photos get codes."""
+    light_spread: Annotated[float, Range(0, 1)] = 0.08
+    """`auto`: the same of slopes of log gains, from the middle of a photo to its sides."""
+    views: ViewCount = 24
+    """Most photos that the test uses."""
+    rate: PositiveRate = 0.01
+    rate_final: PositiveRate = 0.001
+    """Learning rates of Adam at the first and at the last step; their logarithm is interpolated."""
+
+
+class Appearance(Correction):
+    """Appearance of each photo: a code of a few numbers, and a linear decoder that all photos share."""
+
+    options: AppearanceOptions
+    seconds_key = "appearance_seconds"
+    figures_key = "appearance"
+    count_key = "appearances"
+
+    def __init__(self, options: AppearanceOptions, context: ModuleContext) -> None:
+        super().__init__(options, context)
+        names = [view.name for view in context.scene.train]
+        self.indices = {name: index for index, name in reversed([*enumerate(names)])}
+        """Number of a photo by its name; of photos of one name the first."""
+        self.learned: dict[str, Tensor] = {}
+        """`codes` [N C] and `decoder` [14 C]; empty: photos do not differ."""
+        self.moments: dict[str, Tensor] = {}
+        """Adam's means of gradients and of their squares, by the same names."""
+        self.visits: Float[Tensor, N] = torch.zeros(len(names))
+        """Steps of each photo."""
+        self.rendered: set[int] = set()
+        """Photos of the step under way."""
+
+    # -- estimates -----------------------------------------------------------------------------------------------------
+
+    def estimate(self, run: Run, step: int) -> dict[str, float]:
+        """Tests if photos differ, or measures the codes again with the better model."""
+        views, bare = run.train_views, run.views.without(self)
+
+        def measure(index: int) -> Pair:
+            return photo_pair(run, views[index], bare)
+
+        return self.measure_all(measure, step) if self.active else self.test(measure, step)
+
+    def test(self, measure: Callable[[int], Pair], step: int) -> dict[str, float]:
+        """Measures the light of some photos, and the codes of all if they differ."""
+        options, count = self.options, len(self.visits)
+        lights = [light_of(measure(index), slopes=True) for index in sample(range(count), options.views, self.name)]
+        spread, within = spreads_of(lights)
+        differ = options.when == "always" or spread > options.spread or within > options.light_spread
+        action = "learning a code per photo" if differ else EQUAL
+        log_test(step, "exposure spread", spread, options.spread, percent, action)
+        log_test(step, "light spread within photos", within, options.light_spread, percent, action)
+        spreads = {"appearance_spread": spread, "appearance_light": within}
+        return spreads | (self.measure_all(measure, step) if differ else {self.count_key: 0})
+
+    def measure_all(self, measure: Callable[[int], Pair], step: int) -> dict[str, float]:
+        """Restarts learning from the measured responses of all photos."""
+        count = len(self.visits)
+        numbers = torch.stack([response_of(measure(index)) for index in range(count)])
+        self.start(*principal_codes(numbers, self.options.size))
+        self.last_estimate = step
+        size = self.learned["codes"].shape[1]
+        logger.info("step %d: appearance of %d photos measured, %d numbers each", step, count, size)
+        return {self.count_key: count, "appearance_numbers": size}
+
+    def start(self, codes: Float[Tensor, "N C"], decoder: Float[Tensor, "14 C"]) -> None:
+        """Starts learning from these codes and this decoder."""
+        device = self.context.device
+        self.learned = {"codes": codes.to(device).requires_grad_(), "decoder": decoder.to(device).requires_grad_()}
+        self.moments = {name: torch.zeros(2, *value.shape, device=device) for name, value in self.learned.items()}
+        self.visits = torch.zeros(len(codes))
+
+    # -- learning ------------------------------------------------------------------------------------------------------
+
+    def transform_render(
+        self, image: Tensor, view: View, photo: Tensor | None, window: Window | None, learning: bool
+    ) -> Tensor:
+        """Returns the render with the appearance of its photo; where the photo is saturated, more is no error."""
+        if not self.learned:
+            return image
+        index, edges = self.indices[view.name], WHOLE if window is None else window.shares(*view.camera.size)
+        if learning:
+            self.rendered.add(index)
+        codes, decoder = (value if learning else value.detach() for value in self.learned.values())
+        image = image.to(self.context.device)
+        return within_range(respond(image, light_fields(image, edges), decoder @ codes[index]), photo)
+
+    @torch.no_grad()
+    def optimizer_step(self, step: int) -> None:
+        """Takes a step of Adam for the decoder and the codes of rendered photos; keeps the mean code 0."""
+        if not self.rendered:
+            return
+        options, iterations = self.options, self.context.iterations
+        first = round(options.start * iterations)
+        rate = log_linear(step - first, iterations - first, options.rate, options.rate_final)
+        codes, decoder = self.learned.values()
+        if codes.grad is None or decoder.grad is None:
+            return
+        for index in sorted(self.rendered):
+            self.visits[index] += 1
+            codes[index] -= rate * adam_direction(
+                self.moments["codes"][:, index], codes.grad[index], float(self.visits[index])
+            )
+        decoder -= rate * adam_direction(self.moments["decoder"], decoder.grad, float(self.visits.sum()))
+        codes -= codes.mean(0)
+        self.zero_grad()
+
+    def zero_grad(self) -> None:
+        """Drops the gradients of a step."""
+        self.rendered.clear()
+        for value in self.learned.values():
+            value.grad = None
+
+    @torch.no_grad()
+    def fit_render(
+        self, image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"], fitted: Bool[Tensor, "H W"]
+    ) -> Float[Tensor, "3 H W"] | None:
+        """Returns the render of a held-out view by the code that fits these pixels of its photo; None: no codes."""
+        if not self.learned:
+            return None
+        codes, decoder = (value.detach() for value in self.learned.values())
+        spread = codes.std(0, unbiased=False).clamp(min=LEAST_SPREAD)
+        image = image.to(decoder.device)
+        code = fit_code(image, photo, fitted, decoder, spread**-2)
+        return respond(image, light_fields(image), decoder @ code)
+
+    # -- files ---------------------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Returns codes, decoder and Adam's state; empty without codes."""
+        if not self.learned:
+            return {}
+        tensors = {name: value.detach() for name, value in self.learned.items()}
+        tensors |= {f"adam.{name}": value for name, value in self.moments.items()}
+        return tensors | {"visits": self.visits, "last_estimate": torch.tensor(self.last_estimate)}
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restores a checkpoint; empty: there are no codes."""
+        self.learned, self.moments, self.last_estimate = {}, {}, 0
+        if not tensors:
+            return
+        self.start(tensors["codes"].clone(), tensors["decoder"].clone())
+        self.moments = {name: tensors[f"adam.{name}"].to(self.context.device).clone() for name in self.learned}
+        self.visits, self.last_estimate = tensors["visits"].clone(), int(tensors["last_estimate"])
+
+    @classmethod
+    def figures(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """Returns the step of the test, its spreads, and how many photos have codes of how many numbers."""
+        first = lines[0]
+        figures = {"step": first["step"], "spread": first.get("appearance_spread"), "photos": first[cls.count_key]}
+        return figures | {"within": first.get("appearance_light"), "numbers": first.get("appearance_numbers", 0)}
+
+    @classmethod
+    def remarks(cls, evaluation: Mapping[str, Any]) -> Iterator[str]:
+        """Reports that photos have codes, and the figures of test views with codes of their own."""
+        figures = evaluation.get("appearance") or {}
+        if figures.get("photos"):
+            yield (
+                f"each photo has an appearance code of {figures['numbers']} numbers from step {figures['step']:,} on: "
+                "the model has that of the mean photo"
+            )
+        if fitted := (evaluation.get("fitted") or {}).get("appearance"):
+            yield (
+                f"test views with codes fitted on their left halves: {fitted['psnr']:.2f} dB on the right halves, "
+                f"{fitted['psnr_rendered']:.2f} dB without codes"
+            )
+
+
+def response_of(pair: Pair) -> Float[Tensor, "14"]:
+    """Measures the numbers of a photo's response."""
+    image, photo, _ = pair
+    return fit_code(image, photo, usable_pixels(*pair), torch.eye(NUMBERS), torch.full((NUMBERS,), PRIOR**-2))
