@@ -37,8 +37,11 @@ PHOTOS, WIDTH, HEIGHT, POINTS = 500, 1600, 1200, 100_000
 SUBJECTS = {
     "fox": ["scene=colmap", "scene.downscale=4", "iterations=600"],
     "many": ["scene=transforms", "scene.split=none", "iterations=20"],
+    "many_plain": ["scene=transforms", "scene.split=none", "iterations=20", "training.supersampling.factor=1"],
 }
 """Settings by scene; those of `many` are the shortest run with steps of all sizes."""
+MADE = ("many", "many_plain")
+"""Scenes that are made here."""
 PHASES = ("start", "steps", "finer steps", "evaluation")
 COLUMNS = [["scene", "scene"], *([phase, f"{phase}, MB"] for phase in PHASES), ["peak", "peak, MB"]]
 NOTE = "Largest resident memory of the process in each phase, MB (1e6 bytes): also libraries, photos, Adam's moments."
@@ -128,9 +131,9 @@ def make_capture(folder: Path, photos: int = PHOTOS, size: tuple[int, int] = (WI
 def row_of(name: str, source: Path, scenes: Path, label: str) -> dict[str, Any]:
     """Returns the table's line of one scene by one source."""
     with TemporaryDirectory() as folder:
-        if name == "many":
+        if name in MADE:
             make_capture(Path(folder))
-        path = folder if name == "many" else scenes / name
+        path = folder if name in MADE else scenes / name
         phases = peaks_of(source, [*SUBJECTS[name], f"scene.path={path}"])
     used = {phase: round(value) for phase, value in phases.items() if value}
     return {"scene": label, **used, "peak": max(used.values())}
