@@ -1,7 +1,7 @@
 """Colours of a photo as a function of its render: light across the photo, then a colour matrix.
 
 Ours: 14 numbers, all 0 for the identity, in display values; Gauss-Newton fits them. A falloff towards the corners and a
-tone, as in PPISP (Deutsch et al. 2026), recovered no more on demo.
+tone, as in PPISP (Deutsch et al. 2026), recovered no more of demo with gains and slopes.
 """
 
 import torch
