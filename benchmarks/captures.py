@@ -1,12 +1,13 @@
 """What real captures do, made on purpose, and what mends it: the tables of docs/benchmarks/photo-corrections.md.
 
-    python benchmarks/captures.py --scenes FOLDER [--what exposure,light,poses,adjust,covered,passed,blur,sky]
+    python benchmarks/captures.py --scenes FOLDER [--what exposure,light,appearance,poses,adjust,covered,...]
                                   [--only demo,fox] [--seeds 0,1] [--share 0.4] [--label NAME]
 
 FOLDER holds `fox`, `desk_bottle` (COLMAP), `lego` (NeRF-Synthetic) and `castle` (photographs alone); without it only
 the built-in scene is measured. `exposure`: training photographs at exposures of their own, with and without
 `training.exposure.when=auto`, beside the scene as it is, with it. `light`: training photographs that are brighter
-towards a side, each towards another, with and without `training.exposure.grid=auto`, likewise. `poses`: training
+towards a side, each towards another, with and without `training.exposure.grid=auto`, likewise. `appearance`: both at
+once, with exposures, grids, and codes of `training.appearance`, also fitted to test views. `poses`: training
 cameras turned by half a pixel and by two, with and without `training.poses.when=auto`, likewise. `adjust`: models of
 structure from motion whose cameras say something wrong, with and without `scene.adjust=auto`, likewise. `covered`:
 something plain stands before a part of each training photograph, with and without `training.distractors.when=auto`,
@@ -60,6 +61,17 @@ MENDED = ", auto"
 SHADED, EVENED = ("scene.disturb.shade=0.2",), (*JUDGED, "training.exposure.grid=auto")
 LIGHT_ARMS = {"as it is, auto": EVENED, "shaded": SHADED, "shaded, auto": (*SHADED, *EVENED)}
 """The same of light within photographs."""
+DIFFERENT, EXPOSED = (*DISTURBED, *SHADED), ("training.exposure.when=always",)
+CODES = "training.appearance.when=always"
+APPEARANCE_ARMS = {
+    "unchanged": (),
+    "degraded": DIFFERENT,
+    "degraded, exposure": (*DIFFERENT, *EXPOSED),
+    "degraded, exposure and grid": (*DIFFERENT, *EXPOSED, "training.exposure.grid=always"),
+    "degraded, codes of 8": (*DIFFERENT, CODES, "training.appearance.size=8"),
+    "degraded, codes of 14": (*DIFFERENT, CODES, "training.appearance.size=14"),
+}
+"""The same of both, with codes beside."""
 CORRECTED = ("training.poses.when=auto",)
 HALF, TWO = ("scene.disturb.pose=0.5",), ("scene.disturb.pose=2",)
 POSE_ARMS = {
@@ -483,7 +495,41 @@ def sky(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     return "Something behind the scene", *compared(SKY_ARMS, scenes, given)
 
 
+# -- appearance --------------------------------------------------------------------------------------------------------
+
+
+def with_codes(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
+    """PSNR of a run at x1: as rendered, in fitted colours, and of right halves with codes fitted to left ones."""
+    steps = round(given.share * steps_among(SUBJECTS[scene]))
+    words = [*OWN, *APPEARANCE_ARMS[arm], f"iterations={steps}", "eval.zoom=[1]", "eval.competitor=null"]
+    folder = trained(scene, seed, given, words, f"appearance {arm}")
+    evaluation = read_json(folder / "evaluation.json")
+    codes = evaluation.get("fitted", {}).get("appearance", {})
+    found = {"x1": evaluation["psnr"], "fitted1": render_probe(folder, "fitted", FITTED)["1"]["psnr"]}
+    return found | ({"codes": codes["psnr"], "neutral": codes["psnr_rendered"]} if codes else {})
+
+
+def appearance(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """Photographs at exposures of their own that are brighter towards a side, and what mends that."""
+
+    def row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
+        found = by_arm[arm]
+        means = {key: told([one[key] for one in found], ".2f") for key in found[0]}
+        return {"scene": scene, "name": arm, "seeds": len(found), **means}
+
+    columns = [["scene", "scene"], ["name", "photographs"], ["seeds", "seeds"], ["fitted1", "x1"]]
+    columns += [["x1", "x1 as rendered"], ["codes", "right halves, codes fitted on the left"]]
+    columns += [["neutral", "the same as rendered"]]
+    note = (
+        f"{given.share:g} of the steps; gains of display values by 0.2 and slopes of log gains by 0.2 (standard "
+        f"deviations) in each training photograph. {EXPOSURE_NOTE}"
+    )
+    title = "Photographs at exposures of their own that are brighter towards a side"
+    return title, columns, rows_by_arm(APPEARANCE_ARMS, with_codes, row, scenes, given), note
+
+
 WHAT: dict[str, Measure] = {
+    "appearance": appearance,
     "exposure": exposure,
     "light": light,
     "poses": poses,
