@@ -49,6 +49,8 @@ SUBJECTS = {
     "room": ("scene=room", "iterations=1500"),
 }
 BUILT_IN = ("demo", "room")
+FROM_RANDOM = ("lego",)
+"""Scenes without points: models start from more random ones than they end with."""
 FEWER = {"fox": 25000, "fox_4": 40000, "lego": 5000, "castle": 40000, "demo": 20000, "room": 10000}
 """Primitives of the smaller budget."""
 ARMS = (
@@ -79,11 +81,13 @@ def overrides_of(arm: str, scene: str, published: dict[str, Any]) -> list[str]:
     """What makes an arm; `published`: evaluation of the published arm with the same seed."""
     number = published["primitives"] if arm.endswith("as published") else FEWER[scene]
     capacity = arm.split()[0]
+    own = [f"backbone.capacity={capacity}", f"backbone.{capacity}.primitives={number}"]
+    fewer = [f"scene.random_points={number}"] if capacity == "mcmc" and scene in FROM_RANDOM else []  # it removes none
     return {
         "published": [PUBLISHED],
         "adaptive": [ADAPTIVE],
         "published, held at fewer": [PUBLISHED, f"backbone.max_primitives={number}"],
-    }.get(arm, [f"backbone.capacity={capacity}", f"backbone.{capacity}.primitives={number}"])
+    }.get(arm, [*own, *fewer])
 
 
 def folder_of(arm: str, scene: str, backbone: str, seed: int, given: argparse.Namespace) -> Path:
@@ -101,8 +105,8 @@ def evaluation_of(arm: str, scene: str, backbone: str, seed: int, given: argpars
 def words_of(wish: Sequence[str], scene: str, backbone: str, seed: int, given: argparse.Namespace) -> list[str]:
     """The whole composition of a run that differs from the published one by a wish."""
     where = [] if scene in BUILT_IN else [f"scene.path={given.scenes / scene.split('_')[0]}"]
-    zooms = f"eval.zoom=[{','.join(ZOOMS)}]"
-    return [f"backbone={backbone}", *wish, *SUBJECTS[scene], *where, f"seed={seed}", zooms]
+    judged = f"eval.zoom=[{','.join(ZOOMS)}]", "eval.competitor=null"
+    return [f"backbone={backbone}", *wish, *SUBJECTS[scene], *where, f"seed={seed}", *judged]
 
 
 def trained(folder: Path, words: Sequence[str], given: argparse.Namespace) -> dict[str, Any]:
