@@ -239,6 +239,8 @@ def test_a_line_through_seven_of_ten_points_is_found() -> None:
     wrong[[1, 5, 8]] = torch.tensor([90.0, 1.0, 2.0])
     assert robust_line(x, wrong) == pytest.approx((3, 2), abs=1e-3)
     assert robust_line(x, 3 * x, shift=False) == (pytest.approx(3), 0.0)
+    many = torch.linspace(1, 50, 20_000)  # all pairs of them would not fit into memory
+    assert robust_line(many, 3 * many + 2) == pytest.approx((3, 2), abs=1e-3)
     columns = torch.stack([x, torch.ones(10)], 1)
     assert abs(float(torch.linalg.lstsq(columns, wrong).solution[0]) - 3) > 1
 

@@ -34,6 +34,8 @@ STRICTLY_BEHIND = 1.05
 """Such a point is hidden if it is this many times as far as its nearest neighbour in the picture."""
 FEWEST = 10
 """Fewest points on a map that it is fitted to."""
+MOST_PAIRED = 1000
+"""Most points whose pairs are compared for the first line of a fit."""
 ROUNDS, LEAST = 50, 1e-4
 """Rounds of reweighting of a fit, and the least relative error that lowers a weight."""
 POOR = 0.2
@@ -187,7 +189,7 @@ def robust_line(x: Float[Tensor, "K"], y: Float[Tensor, "K"], shift: bool = True
 
 
 def median_line(x: Float[Tensor, "K"], y: Float[Tensor, "K"]) -> Float[Tensor, "2"]:
-    """Return (a, b) of the line with the median slope of all pairs of points, and the median offset."""
-    first, second = torch.combinations(torch.arange(len(x))).unbind(1)
+    """Return (a, b) of the line with the median slope of pairs of up to MOST_PAIRED points, and the median offset."""
+    first, second = torch.combinations(torch.arange(0, len(x), -(-len(x) // MOST_PAIRED))).unbind(1)
     slope = ((y[second] - y[first]) / (x[second] - x[first])).nanmedian().nan_to_num(0.0)
     return torch.stack([slope, (y - slope * x).median()])
