@@ -29,6 +29,7 @@ from measuring.runs import gsx, train
 RESULTS = Path(__file__).parent / "results"
 SCENE = ("scene=room", "scene.rooms=3", "scene.train_views=180", "scene.test_views=18", "scene.points=9000")
 QUICK = ("training.cooldown=0.25", "training.supersampling.start=0.95", "backbone.density.reset_every=1000000")
+ZOOMS = "eval.zoom=[1,2,4]"
 WHOLE, NEAR = 30_000, 1.2
 """Primitives of the model in one piece, and distance from a cut within which a test camera is near it, scene units."""
 COLUMNS = [
@@ -48,7 +49,7 @@ Row = dict[str, object]
 def words_for(seed: int, steps: int, primitives: int) -> list[str]:
     """The settings of a run."""
     budget = ("backbone.capacity=budget", f"backbone.budget.primitives={primitives}")
-    return [*SCENE, *QUICK, *budget, f"seed={seed}", f"iterations={steps}", "eval.zoom=[1,2,4]", "rasterizer=compiled"]
+    return [*SCENE, *QUICK, *budget, f"seed={seed}", f"iterations={steps}", "rasterizer=compiled"]
 
 
 def views_near_cuts(count: int) -> set[str]:
@@ -77,7 +78,7 @@ def trained_blocks(seed: int, steps: int, options: argparse.Namespace) -> tuple[
     """Folders of the runs on all blocks, and the seconds of their training, one after the other."""
     blocks = range(1, options.count + 1)
     folders = [options.runs / f"block_{block}_{options.count}_{steps}_{seed}" for block in blocks]
-    words, found = words_for(seed, steps, options.primitives), []
+    words, found = [*words_for(seed, steps, options.primitives), "eval.competitor=null"], []
     for folder, block in zip(folders, blocks, strict=True):
         found.append(train(folder, [*words, f"scene.block={block}/{options.count}"])["train_seconds"])
     return folders, sum(found)
@@ -90,7 +91,7 @@ def merged_row(seed: int, steps: int, options: argparse.Namespace, near: set[str
     file = merged.with_suffix(".ply")
     if not (merged / "evaluation.json").is_file():
         merge_blocks(folders, file, plugins())
-        gsx(["eval", str(file), *SCENE, "eval.zoom=[1,2,4]", f"folder={merged}"])
+        gsx(["eval", str(file), *SCENE, ZOOMS, f"folder={merged}"])
     row = {"model": f"{options.count} blocks, merged", "steps": steps, "seconds": seconds} | figures(merged, near)
     assert row["primitives"] == len(read_splats(file).gaussians.means)
     return {"seed": seed} | row
@@ -99,7 +100,7 @@ def merged_row(seed: int, steps: int, options: argparse.Namespace, near: set[str
 def measure(seed: int, options: argparse.Namespace, near: set[str]) -> list[Row]:
     """Trains the scene in one piece and in blocks."""
     folder = options.runs / f"whole_{options.whole}_{seed}"
-    whole = train(folder, words_for(seed, options.whole, WHOLE))
+    whole = train(folder, [*words_for(seed, options.whole, WHOLE), ZOOMS])
     row = {"seed": seed, "model": "in one piece", "steps": options.whole, "seconds": whole["train_seconds"]}
     steps = [int(one) for one in options.steps.split(",")]
     return [row | figures(folder, near), *(merged_row(seed, one, options, near) for one in steps)]
