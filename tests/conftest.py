@@ -91,6 +91,16 @@ def begin(signals: None) -> Iterator[Begin]:
         yield begin
 
 
+@pytest.fixture(autouse=True, scope="session")
+def no_watched_cores(tmp_path_factory):
+    """Hides how long threads wait: a thread that watches cores outlives its test and disturbs others."""
+    from gsx.engine import threads
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(threads, "TASKS", tmp_path_factory.mktemp("tasks"))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def shapes_of_every_test():
     """Each test has its functions' first calls checked."""

@@ -66,7 +66,7 @@ def test_what_changes_no_result_does_not_count_for_the_name_of_a_run(foggy: Plug
     [
         (
             ["module=[fig]"],
-            r"Unknown module 'fig'. Choose from blur, .*, fog, .*\. Did you mean 'fog'\?",
+            r"Unknown module 'fig'. Choose from appearance, .*, fog, .*\. Did you mean 'fog'\?",
         ),
         (["module=[fog]", "training.fog.densty=1"], r"Did you mean 'training\.fog\.density'\?"),
         (["module=[fog]", "+training.fog.densty=1"], r"Did you mean 'training\.fog\.density'\?"),
@@ -83,7 +83,7 @@ def test_mistakes_get_the_nearest(words: list[str], complaint: str, foggy: Plugi
 
 
 def test_without_plugins_there_is_no_module_to_choose() -> None:
-    with pytest.raises(ConfigError, match=r"Unknown module '.*'\. Choose from blur, coarse_to_fine"):
+    with pytest.raises(ConfigError, match=r"Unknown module '.*'\. Choose from appearance, blur, coarse_to_fine"):
         compose(["module=[fog]"], plugins())
 
 
