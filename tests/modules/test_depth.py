@@ -26,7 +26,7 @@ from gsx.core.training.render import render_for_training
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import backward
 from gsx.experiments.runs.open import start
-from gsx.modules.depth import Depth, DepthOptions, add_depth_points, mean_errors, prepare_scene, spread_errors
+from gsx.modules.depth import Depth, DepthOptions, add_depth_points, mean_errors, spread_errors
 
 RUN = SimpleNamespace(device=torch.device("cpu"), step=0, backbone=small_gs3d(small_scene(spread(5))))
 """A run without a sky."""
@@ -190,8 +190,8 @@ def test_starting_points_lie_at_the_depths_of_maps() -> None:
 def test_without_depths_always_is_an_error_and_auto_is_off() -> None:
     plain = small_scene(spread(5))
     with pytest.raises(InputError, match=r"training\.depth\.when=always, but no training view of 'small'"):
-        prepare_scene(plain, DepthOptions(when="always"), torch.Generator())
-    assert prepare_scene(plain, DepthOptions(when="auto"), torch.Generator()) is plain
+        DepthOptions(when="always").prepare_scene(plain, torch.Generator())
+    assert DepthOptions(when="auto").prepare_scene(plain, torch.Generator()) is plain
     module = build_module(Depth, DepthOptions(when="auto"), scene=plain)
     module.before_step(RUN)
     assert module.channels(RUN, soft_splats(), front_camera(), 1) is None

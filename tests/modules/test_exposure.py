@@ -196,7 +196,9 @@ def test_they_are_learnt_and_go_on_from_a_checkpoint() -> None:
 
 def test_adam_steps_each_photo_apart_by_a_rate_that_falls() -> None:
     module = exposure_of()
-    assert [module.rate(step) for step in (200, 600, 1000)] == pytest.approx([0.01, math.sqrt(1e-5), 0.001])
+    assert [module.options.rate_at(step, 1000) for step in (200, 600, 1000)] == pytest.approx(
+        [0.01, math.sqrt(1e-5), 0.001]
+    )
     module.start(torch.eye(3, 4).repeat(4, 1, 1))
     image, identity = 0.2 + 0.3 * noise(3, 16, 24), torch.eye(3, 4)
     module.expose(image, 0, learning=True).sum().backward()

@@ -20,15 +20,15 @@ from gsx.core.ranges import Range
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.module import ModuleContext
 from gsx.core.training.run import Run
-from gsx.core.training.schedule import log_linear
 from gsx.modules.bilateral_grid import WHOLE
 from gsx.modules.colour_response import NUMBERS, fit_code, light_fields, principal_codes, respond
-from gsx.modules.corrections import Correction, CorrectionOptions, Times, ViewCount, log_test, percent, sample
+from gsx.modules.corrections import Correction, Times, ViewCount, log_test, percent, sample
 from gsx.modules.exposure import (
     EQUAL,
-    PositiveRate,
+    LearnedOptions,
     adam_direction,
     light_of,
+    numbers_of,
     photo_pair,
     spreads_of,
     within_range,
@@ -44,7 +44,7 @@ LEAST_SPREAD = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
-class AppearanceOptions(CorrectionOptions):
+class AppearanceOptions(LearnedOptions):
     """Options; values in conf/module/appearance.yaml."""
 
     key: ClassVar[str] = "appearance"
@@ -58,9 +58,6 @@ class AppearanceOptions(CorrectionOptions):
     """`auto`: the same of slopes of log gains, from the middle of a photo to its sides."""
     views: ViewCount = 24
     """Most photos that the test uses."""
-    rate: PositiveRate = 0.01
-    rate_final: PositiveRate = 0.001
-    """Learning rates of Adam at the first and at the last step; their logarithm is interpolated."""
 
 
 class Appearance(Correction):
@@ -73,14 +70,13 @@ class Appearance(Correction):
 
     def __init__(self, options: AppearanceOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
-        names = [view.name for view in context.scene.train]
-        self.indices = {name: index for index, name in reversed([*enumerate(names)])}
+        self.indices = numbers_of(context.scene.train)
         """Number of a photo by its name; of photos of one name the first."""
         self.learned: dict[str, Tensor] = {}
         """`codes` [N C] and `decoder` [14 C]; empty: photos do not differ."""
         self.moments: dict[str, Tensor] = {}
         """Adam's means of gradients and of their squares, by the same names."""
-        self.visits: Float[Tensor, N] = torch.zeros(len(names))
+        self.visits: Float[Tensor, N] = torch.zeros(len(context.scene.train))
         """Steps of each photo."""
         self.rendered: set[int] = set()
         """Photos of the step under way."""
@@ -145,9 +141,7 @@ class Appearance(Correction):
         """Takes a step of Adam for the decoder and the codes of rendered photos; keeps the mean code 0."""
         if not self.rendered:
             return
-        options, iterations = self.options, self.context.iterations
-        first = round(options.start * iterations)
-        rate = log_linear(step - first, iterations - first, options.rate, options.rate_final)
+        rate = self.options.rate_at(step, self.context.iterations)
         codes, decoder = self.learned.values()
         if codes.grad is None or decoder.grad is None:
             return

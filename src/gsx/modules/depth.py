@@ -70,6 +70,22 @@ class DepthOptions:
             if (word := getattr(self, key)) not in words:
                 raise ValueError(f"training.depth.{key} is '{word}'; choose from {', '.join(words)}")
 
+    def prepare_scene(self, scene: Scene, generator: torch.Generator) -> Scene:
+        """Returns the scene that training uses, with starting points from depth maps.
+
+        Raises:
+            InputError: there are no measured depths, and `when` is always; or no map is usable.
+        """
+        known = any(getattr(view, field) is not None for view in scene.train for field in SOURCES[self.source])
+        if self.when == "always" and not known:
+            raise InputError(
+                f"training.depth.when=always, but no training view of '{scene.name}' has measured depths: put depth "
+                "maps into a folder 'depths' next to the photos, set training.depth.source=points for the points of a "
+                "COLMAP model, or set training.depth.when=never"
+            )
+        maps = self.when != "never" and self.source != "points"
+        return add_depth_points(scene, self.points, generator) if maps else scene
+
 
 class Depth(TrainingModule):
     """Loss of depths at the measured places of each training view."""
@@ -185,23 +201,6 @@ def random_depths(
     chosen = torch.randperm(len(row), generator=generator)[:count]
     row, column = row[chosen], column[chosen]
     return torch.stack([column, row], 1) + 0.5, depth[row, column]
-
-
-def prepare_scene(scene: Scene, options: DepthOptions, generator: torch.Generator) -> Scene:
-    """Returns the scene that training uses, with starting points from depth maps.
-
-    Raises:
-        InputError: there are no measured depths, and `when` is always; or no map is usable.
-    """
-    known = any(getattr(view, field) is not None for view in scene.train for field in SOURCES[options.source])
-    if options.when == "always" and not known:
-        raise InputError(
-            f"training.depth.when=always, but no training view of '{scene.name}' has measured depths: put depth maps "
-            "into a folder 'depths' next to the photos, set training.depth.source=points for the points of a COLMAP "
-            "model, or set training.depth.when=never"
-        )
-    maps = options.when != "never" and options.source != "points"
-    return add_depth_points(scene, options.points, generator) if maps else scene
 
 
 def add_depth_points(scene: Scene, count: int, generator: torch.Generator) -> Scene:

@@ -41,7 +41,21 @@ MIN_BLOCK_PIXELS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExposureOptions(CorrectionOptions):
+class LearnedOptions(CorrectionOptions):
+    """Learning rates of a correction that Adam learns."""
+
+    rate: PositiveRate = 0.01
+    rate_final: PositiveRate = 0.001
+    """Learning rates of Adam at the first and at the last step; their logarithm is interpolated."""
+
+    def rate_at(self, step: int, iterations: int) -> float:
+        """Returns the learning rate of a step."""
+        first = round(self.start * iterations)
+        return log_linear(step - first, iterations - first, self.rate, self.rate_final)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExposureOptions(LearnedOptions):
     """Options; values in conf/module/exposure.yaml."""
 
     key: ClassVar[str] = "exposure"
@@ -54,9 +68,6 @@ class ExposureOptions(CorrectionOptions):
     get grids."""
     views: ViewCount = 24
     """Most photos that the test uses."""
-    rate: PositiveRate = 0.01
-    rate_final: PositiveRate = 0.001
-    """Learning rates of Adam at the first and at the last step; their logarithm is interpolated."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -124,7 +135,7 @@ class Exposure(Correction):
     def __init__(self, options: ExposureOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
         self.count = len(context.scene.train)
-        self.indices = {view.name: index for index, view in reversed([*enumerate(context.scene.train)])}
+        self.indices = numbers_of(context.scene.train)
         """Number of a photo by its name; of photos of one name the first."""
         self.matrices: Float[Tensor, "N 3 4"] | None = None
         """None: photos do not differ."""
@@ -215,12 +226,6 @@ class Exposure(Correction):
         out = transform_colours(image.to(self.context.device), matrix if learning else matrix.detach())
         return out if grid is None else apply_grid(out, grid if learning else grid.detach(), edges)
 
-    def rate(self, step: int) -> float:
-        """Returns the learning rate of a step."""
-        options, iterations = self.options, self.context.iterations
-        first = round(options.start * iterations)
-        return log_linear(step - first, iterations - first, options.rate, options.rate_final)
-
     @torch.no_grad()
     def optimizer_step(self, step: int) -> None:
         """Takes a step of Adam for each rendered photo; keeps the mean exposure the identity."""
@@ -232,7 +237,7 @@ class Exposure(Correction):
             for values, moments in learnt:
                 if values is not None and values.grad is not None:
                     direction = adam_direction(moments[:, index], values.grad[index], float(self.visits[index]))
-                    values[index] -= self.rate(step) * direction
+                    values[index] -= self.options.rate_at(step, self.context.iterations) * direction
         self.matrices.copy_(centred_on_identity(self.matrices))
         if self.grids is not None:
             self.grids.copy_(without_common(self.grids))
@@ -292,6 +297,11 @@ class Exposure(Correction):
                 f"light within photos is spread by {figures['within']:.1%}, each has a bilateral grid from step "
                 f"{figures['step']:,} on"
             )
+
+
+def numbers_of(views: Sequence[View]) -> dict[str, int]:
+    """Returns the number of each photo by its name, of photos of one name that of the first."""
+    return {view.name: index for index, view in reversed([*enumerate(views)])}
 
 
 def within_range(image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"] | None) -> Float[Tensor, "3 H W"]:

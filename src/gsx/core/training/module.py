@@ -7,7 +7,7 @@ default that changes nothing. A module must not draw from `run.generator`.
 
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -34,6 +34,14 @@ class ModuleContext:
     device: torch.device
     batch: int = 1
     """Views per step."""
+
+
+@runtime_checkable
+class PreparesScene(Protocol):
+    """Options of a module that changes the scene before the run is built, such as its starting points."""
+
+    def prepare_scene(self, scene: Scene, generator: torch.Generator) -> Scene:
+        """Returns the scene that the run uses; the generator depends on the run's seed and the module's name."""
 
 
 class TrainingModule:

@@ -27,18 +27,23 @@ KEYS = ("psnr", "ssim", "psnr_rendered", "ssim_rendered")
 def fitted_figures(run: Run, view: View, image: Float[Tensor, "3 H W"], options: EvalOptions) -> dict[str, Any]:
     """Returns figures of a view's right half under the key `fitted`, by name of the module; empty: none fits views."""
     photo, counted = view.image(), view.counted()
-    left, right = (half(view, counted, right=side) for side in (False, True))
-    truth, figures = black_out(photo, counted), dict[str, dict[str, float]]()
+    left = half(view, counted, right=False)
+    fitted = {name: module.fit_render(image, photo, left) for name, module in run.modules.items()}
+    renders = {name: render for name, render in fitted.items() if render is not None}
+    if not renders:
+        return {}
+    right = half(view, counted, right=True)
+    if not right.any():
+        return {}
+    truth = black_out(photo, counted)
 
     def measure(render: Float[Tensor, "3 H W"]) -> tuple[float, float]:
         pair = black_out(options.measured(render), counted), truth
         return psnr(*pair, right), ssim(*pair, options.ssim, right)
 
-    for name, module in run.modules.items() if right.any() else ():
-        fitted = module.fit_render(image, photo, left)
-        if fitted is not None:
-            figures[name] = dict(zip(KEYS, (*measure(fitted.to(image.device)), *measure(image)), strict=True))
-    return {"fitted": figures} if figures else {}
+    bare = measure(image)
+    figures = {name: (*measure(render.to(image.device)), *bare) for name, render in renders.items()}
+    return {"fitted": {name: dict(zip(KEYS, values, strict=True)) for name, values in figures.items()}}
 
 
 def fitted_summary(views: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

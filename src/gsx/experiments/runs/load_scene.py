@@ -12,12 +12,12 @@ from gsx.core.data.scene import PointCloud, Scene, View, extent_of
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import expand_home, file_count
 from gsx.core.seeds import derived_seed
+from gsx.core.training.module import PreparesScene
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.remarks import NOT_MEASURED
 from gsx.experiments.runs.degraded import degrade
 from gsx.experiments.runs.settings import Settings
 from gsx.formats.origin import Origin
-from gsx.modules.depth import DepthOptions, prepare_scene
 from gsx.scenes.blocks import BlockChoice, block_of, parsed_block
 from gsx.scenes.depth_files import with_depth_maps
 from gsx.scenes.filling import fill_gaps
@@ -63,9 +63,10 @@ def load_scene(settings: Settings, origin: Origin | None = None) -> Scene:
     if (count := getattr(options, "stereo", 0)) and len(scene.points):
         generator = torch.Generator().manual_seed(derived_seed("stereo", settings.general.seed))
         scene = add_stereo_points(scene, count, generator)
-    if (chosen := settings.modules.get("depth")) and isinstance(chosen.options, DepthOptions):
-        generator = torch.Generator().manual_seed(derived_seed("depth points", settings.general.seed))
-        scene = prepare_scene(scene, chosen.options, generator)
+    for name, chosen in settings.modules.items():
+        if isinstance(chosen.options, PreparesScene):
+            generator = torch.Generator().manual_seed(derived_seed(f"{name} points", settings.general.seed))
+            scene = chosen.options.prepare_scene(scene, generator)
     return scene
 
 
