@@ -54,9 +54,6 @@ class Parser(argparse.ArgumentParser):
         raise ConfigError(f"{self.prog}: {message}. See {self.prog} --help")
 
 
-# -- values ------------------------------------------------------------------------------------------------------------
-
-
 def positive(kind: type[int] | type[float]) -> Callable[[str], Any]:
     """Return a reader of finite numbers above 0."""
 
@@ -96,9 +93,6 @@ def refuse_axes_of_run(verb: str, options: argparse.Namespace) -> None:
     """Raise InputError for --axes of a run, which has the axes of its scene."""
     if options.axes != AUTO and splat_file_at(options.target).is_dir():
         raise InputError(f"{verb}: --axes {options.axes} is for splat files, {options.target} is a run: leave it out")
-
-
-# -- training ----------------------------------------------------------------------------------------------------------
 
 
 def parse_train(arguments: list[str]) -> list[str]:
@@ -168,9 +162,6 @@ def with_run_folder(parser: Parser, options: argparse.Namespace) -> argparse.Nam
         raise InputError(f"{parser.prog} needs a run folder: {parser.prog} RUN [KEY=VALUE ...]")
     options.run = Path(options.run)
     return options
-
-
-# -- finished runs -----------------------------------------------------------------------------------------------------
 
 
 def parse_eval(arguments: list[str]) -> argparse.Namespace:
@@ -304,9 +295,6 @@ def parse_merge(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="run, or folder with runs below it")
     parser.add_argument("--to", type=Path, required=True, metavar="FILE", help="splat file to write")
     return parser.parse_args(arguments)
-
-
-# -- reports and facts -------------------------------------------------------------------------------------------------
 
 
 def parse_report(arguments: list[str]) -> argparse.Namespace:

@@ -120,9 +120,6 @@ def reduce_table(table: ParameterTable, gone: Int[Tensor, "K"], into: Int[Tensor
         append_rows(table, new, moments)
 
 
-# -- a round -----------------------------------------------------------------------------------------------------------
-
-
 def next_round(rows: Rows, importance: Float[Tensor, "N"]) -> Round:
     """Computes what goes next, the cheapest first; `rows`: empty where none can be merged."""
     count = len(importance)

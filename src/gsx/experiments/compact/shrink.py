@@ -73,9 +73,6 @@ class Candidate:
         return asdict(self) if math.isfinite(self.drop) else asdict(self) | {"psnr": {}, "drop": None}
 
 
-# -- importance --------------------------------------------------------------------------------------------------------
-
-
 def closer_window(camera: Camera) -> tuple[Camera, Window]:
     """Returns (the middle of a camera's frame at twice its focal length; its place in the whole raster at that focal
     length)."""
@@ -125,9 +122,6 @@ def mean_colours(run: Run, lower: Sequence[Float[Tensor, "n 3 N"]]) -> Float[Ten
     if constant is None:
         return None
     return colour_of_constant(constant.detach()[:, 0] + (lower[0][0].T if lower else 0.0))
-
-
-# -- search ------------------------------------------------------------------------------------------------------------
 
 
 class Search:

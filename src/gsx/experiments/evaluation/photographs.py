@@ -73,9 +73,6 @@ def concentrated(error: Float[Tensor, "H W"], counted: Bool[Tensor, "H W"] | Non
     return float(most / cells.sum().clamp_min(1e-30))
 
 
-# -- all of them -------------------------------------------------------------------------------------------------------
-
-
 def remarks_on(findings: Sequence[Finding], exposures: str, learnt: bool, corrected: bool = False) -> list[list[str]]:
     """Compares each photo with all and lists its faults.
 

@@ -49,9 +49,6 @@ class CapNotice:
             )
 
 
-# -- from metrics to evaluation.json -----------------------------------------------------------------------------------
-
-
 def gathered(lines: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """Returns counts of primitives over the cap and of pseudo views' pictures, from lines of metrics.jsonl."""
     lines = list(lines)
@@ -87,9 +84,6 @@ def totals(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def shares(counts: Mapping[str, int], requested: Mapping[str, int]) -> dict[str, float]:
     """Returns counts by scale as shares of what was requested at that scale."""
     return {scale: counts.get(scale, 0) / count for scale, count in requested.items()}
-
-
-# -- in words ----------------------------------------------------------------------------------------------------------
 
 
 def remarks_of(evaluation: Mapping[str, Any]) -> list[str]:

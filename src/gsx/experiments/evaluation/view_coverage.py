@@ -115,9 +115,6 @@ class SceneCoverage:
         return {"coverage": coverage, "views": entries}
 
 
-# -- figures -----------------------------------------------------------------------------------------------------------
-
-
 def class_of(share: float) -> str:
     """Returns the class of a covered share (CLASSES)."""
     return next(name for name, least in CLASSES.items() if share >= least)
@@ -183,9 +180,6 @@ def class_text(name: str, figures: Mapping[str, Any]) -> str:
     """Returns the number of views of a class and their PSNR in words."""
     quality = "" if figures["psnr"] is None else f" ({figures['psnr']:.2f} dB)"
     return f"{LABELS[name]} {figures['views']}{quality}"
-
-
-# -- geometry ----------------------------------------------------------------------------------------------------------
 
 
 def scene_coverage(train: Sequence[View], test: Sequence[View], draw: Render, far: float) -> SceneCoverage:

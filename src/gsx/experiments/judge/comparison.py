@@ -130,9 +130,6 @@ def subjects_of(folders: Sequence[Path], words: Sequence[str], overrides: Sequen
     return [Subject(overrides=(*words, *overrides))]
 
 
-# -- files -------------------------------------------------------------------------------------------------------------
-
-
 def write_results(folder: Path, results: Sequence[Mapping[str, Any]], baseline: str, words: Sequence[str]) -> list[str]:
     """Writes JSON, CSV and page; returns the table in lines."""
     rows = rows_of(results, baseline)

@@ -73,9 +73,6 @@ def without_pictures(folder: Path) -> str:
     return f"'{folder}' holds no pictures ({', '.join(SUFFIXES)}): give the folder of the renders"
 
 
-# -- programs ----------------------------------------------------------------------------------------------------------
-
-
 def inria(folder: Path) -> Layout | None:
     """Recognises renders of 3D-GS and its descendants: MODEL/test/ours_N/renders, and gt."""
     iterations = sorted([*folder.glob("test/ours_*"), *folder.glob("ours_*")], key=iteration_of)
@@ -139,9 +136,6 @@ def plain(folder: Path) -> Layout | None:
         files = direct if zooms else pictures_below(folder)
         sets = [PictureSet(folder=folder, files=files), *sets] if files else sets
     return Layout(program="pictures", sets=tuple(sets)) if sets else None
-
-
-# -- files -------------------------------------------------------------------------------------------------------------
 
 
 def subfolders(folder: Path) -> list[Path]:

@@ -90,8 +90,6 @@ class Matcher:
         notes += rounding_notes(placed, {view.name: view for view in self.views})
         return Placed(pictures=placed, notes=tuple(notes), by_order=by_order)
 
-    # -- views ---------------------------------------------------------------------------------------------------------
-
     def match(self, pictures: PictureSet) -> tuple[dict[View, Path], list[str], bool]:
         """Returns the pictures by view, remarks, and whether order alone decided."""
         named = dict(self.named(pictures))
@@ -170,8 +168,6 @@ class Matcher:
     def example(self, pictures: PictureSet) -> str:
         """Returns a view and a picture, for an error on names."""
         return f"the first view is '{self.views[0].name}', the first picture {pictures.files[0].name}"
-
-    # -- zooms ---------------------------------------------------------------------------------------------------------
 
     def sized(self, view: View, file: Path, pictures: PictureSet) -> PlacedPicture:
         """Returns a picture with the camera of its size; InputError: it is that of no zoom."""

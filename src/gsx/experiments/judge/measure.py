@@ -114,8 +114,6 @@ class Measurement:
             if one.method.camera(view, factor) is not None
         )
 
-    # -- pictures ------------------------------------------------------------------------------------------------------
-
     def pictures(self, method: Method, view: View) -> Iterator[tuple[float, Zoomed]]:
         """Yields a method's pictures of a view with the truth of their size, by zoom."""
         first = self.picture(method, view, 1)
@@ -155,8 +153,6 @@ class Measurement:
     def enlarged(self, picture: Picture, finer: View) -> Picture:
         """Returns a picture on the raster of a finer view, by bicubic interpolation."""
         return self.protocol.options.measured(bicubic(picture, *finer.camera.size))
-
-    # -- figures -------------------------------------------------------------------------------------------------------
 
     def plain_figures(self, zoomed: Zoomed) -> ZoomFigures:
         """Measures an x1 picture, which nothing competes with."""

@@ -64,9 +64,6 @@ def read_picture(path: Path, background: Float[Tensor, "3"]) -> Float[Tensor, "3
     return colour * alpha + background[:, None, None] * (1 - alpha)
 
 
-# -- NumPy arrays ------------------------------------------------------------------------------------------------------
-
-
 def array_header(path: Path) -> Header:
     """Reads size and peculiarities of a NumPy array from its header."""
     array = mapped(path)

@@ -129,9 +129,6 @@ def refuse_other_views(subject: Subject, scene: Scene) -> None:
         )
 
 
-# -- methods -----------------------------------------------------------------------------------------------------------
-
-
 def methods_of(
     subject: Subject,
     entries: Sequence[Entry],
@@ -249,9 +246,6 @@ def log_notes(method: Method, zooms: Sequence[float], scene: Scene) -> None:
 def listed(zooms: Sequence[float]) -> str:
     """Formats zooms."""
     return ", ".join(f"x{factor:g}" for factor in zooms)
-
-
-# -- protocol ----------------------------------------------------------------------------------------------------------
 
 
 def protocol_for(settings: Settings, scene: Scene, zooms: Sequence[float], folder: Path) -> Protocol:

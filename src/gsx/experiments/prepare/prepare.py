@@ -109,9 +109,6 @@ def sizes_of(file: str, zoomed: dict[float, Zoomed]) -> dict[str, list[int]]:
     return {f"{factor:g}": list(views[file].camera.size) for factor, views in zoomed.items() if file in views}
 
 
-# -- files -------------------------------------------------------------------------------------------------------------
-
-
 def write_folder(folder: Path, content: Prepared, manifest: dict[str, Any], advance: Advance) -> None:
     """Write all files; the manifest is the last one."""
     scene, points, origin = content.scene, content.scene.points, content.scene.origin

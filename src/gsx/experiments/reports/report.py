@@ -173,9 +173,6 @@ def quality(view: dict[str, Any]) -> float:
     return value if is_number(value) else -math.inf
 
 
-# -- charts ------------------------------------------------------------------------------------------------------------
-
-
 def zoom_rows(evaluation: dict[str, Any]) -> list[dict[str, Any]]:
     """Returns figures and gains of each zoom, in order."""
     return [

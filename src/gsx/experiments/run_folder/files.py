@@ -161,9 +161,6 @@ def evaluated_step(run: RunFiles) -> int:
     return int(run.evaluation.get("step") or 0)
 
 
-# -- reading -----------------------------------------------------------------------------------------------------------
-
-
 def read_run(folder: Path) -> RunFiles:
     """Read all readable content of a run."""
     problems: dict[str, str] = {}
@@ -261,9 +258,6 @@ def runs_below(folder: Path) -> Iterator[Path]:
             yield child
         else:
             yield from runs_below(child)
-
-
-# -- figures and state -------------------------------------------------------------------------------------------------
 
 
 def gain_of(entry: dict[str, Any], figure: str = "psnr", rival: str = "enlarged") -> float | None:

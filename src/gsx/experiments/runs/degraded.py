@@ -81,9 +81,6 @@ def blur(source: ImageSource, camera: Camera, across: float, down: float) -> UIn
     return blurred[:, frame.top : frame.top + camera.height, frame.left : frame.left + camera.width]
 
 
-# -- one photo ---------------------------------------------------------------------------------------------------------
-
-
 def generator_of(kind: str, name: str) -> torch.Generator:
     """Return the generator of one photo's numbers, which do not depend on the run's seed."""
     return torch.Generator().manual_seed(derived_seed(f"disturbed {kind}", name))
@@ -151,9 +148,6 @@ def degrade_view(view: View, by: Mapping[str, float], slopes: tuple[float, float
         movement=view.camera.frame.shares(*pair_of("blur", view.name, moved)) if moved else None,
     )
     return replace(view, source=source, camera=turn(view.camera, view.name, pose) if pose else view.camera)
-
-
-# -- a scene -----------------------------------------------------------------------------------------------------------
 
 
 def choose(names: Sequence[str], share: float) -> set[str]:

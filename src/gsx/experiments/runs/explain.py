@@ -121,9 +121,6 @@ def below(key: str, node: dict[str, Any], files: Sequence[Parsed]) -> list[str]:
     return ["", f"below {key}:", *lines] if lines else []
 
 
-# -- files ---------------------------------------------------------------------------------------------------------
-
-
 def parsed(sources: Sequence[Source]) -> list[Parsed]:
     """Parse the files of a composition."""
     texts = [source.file.read_text(encoding="utf-8") for source in sources]
@@ -179,9 +176,6 @@ def head_of(file: Path) -> str:
             break
         words += [line.lstrip("# ")] if "@package" not in line else []
     return shorten(re.split(r"(?<!et al)\. ", " ".join(words))[0], WIDTH, placeholder=" ...")
-
-
-# -- types ---------------------------------------------------------------------------------------------------------
 
 
 def kind_of(key: str, settings: Settings) -> str:

@@ -232,9 +232,6 @@ def as_in_page(gaussians: Gaussians) -> Gaussians:
     return gaussians_from(decode_compressed_ply(encode_compressed_ply(arrays_of(gaussians), ())))
 
 
-# -- of another file ---------------------------------------------------------------------------------------------------
-
-
 def convert(source: Path, to: Path, axes: str = AUTO, spz: SpzForm = SPZ_FORM, local: bool = False) -> None:
     """Write the splats of a file in the format of another suffix, with its mark for compensated opacities.
 
@@ -260,8 +257,6 @@ def convert(source: Path, to: Path, axes: str = AUTO, spz: SpzForm = SPZ_FORM, l
     written = len(read_again(to, spz).means)
     logger.info("%s: %d splats read, %d written, %.2f MB", to, len(gaussians.means), written, to.stat().st_size / 1e6)
 
-
-# -- coordinates far from (0, 0, 0) ------------------------------------------------------------------------------------
 
 COMMENTED = (STANDARD, ".compressed.ply", ".glb", "")
 """Suffixes of files with comments; empty: a page."""

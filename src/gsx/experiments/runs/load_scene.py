@@ -211,8 +211,6 @@ def unit_of(run: Run) -> float:
     return float(run.config["scene"].get("unit", 1.0))
 
 
-# -- cameras in one place: only the points measure the scene -----------------------------------------------------------
-
 ONE_PLACE = 3e-5
 """Largest extent of cameras that is rounding, as a share of the points' median distance: at a focal length of 3,000 px
 points then move by 0.1 px, which no reconstruction measures. Rounded poses are at 1e-6, close-ups above 1e-3."""

@@ -198,9 +198,6 @@ def arc(bearings: Sequence[float]) -> tuple[float, float]:
     return start + half, half
 
 
-# -- animations ----------------------------------------------------------------------------------------------------
-
-
 def write_animation(path: Path, frames: Iterable[Float[Tensor, "3 H W"]], fps: float) -> None:
     """Write frames, display values in [0, 1], one at a time: .gif; .webp and .mp4 need the extra `video`.
 

@@ -167,9 +167,6 @@ def between_words(file: Path, placed: Sequence[str]) -> str:
     return f"after {before[0]}" if before else f"before {after[0]}" if after else ""
 
 
-# -- files -------------------------------------------------------------------------------------------------------------
-
-
 @torch.no_grad()
 def write_retakes(run: Run, coverage: SceneCoverage, pixels: int) -> list[str]:
     """Write index.json and pictures of what to photograph again; return it in lines for the log."""
@@ -253,9 +250,6 @@ def unplaced_entries(place: Pictures, files: Sequence[Path], placed: Sequence[st
             continue
         entry["files"] = {"photo": place.save(f"unplaced_{number}.truth", thumbnail(image), lossy=True)}
     return entries
-
-
-# -- words -------------------------------------------------------------------------------------------------------------
 
 
 def fact_line(statistics: Statistics, faults: Sequence[PhotoFault], missing: Sequence[Path]) -> str:

@@ -143,8 +143,6 @@ def composition_of(path: Path, overrides: Sequence[str]) -> list[str]:
     return [*words, *overrides]
 
 
-# -- does a file belong to a scene? ------------------------------------------------------------------------------------
-
 MOST_SPLATS, MOST_POINTS, MOST_VIEWS = 50_000, 1000, 50
 """Numbers to compare, evenly spread over all."""
 LEAST_IN_VIEW = 0.05

@@ -169,9 +169,6 @@ def value_at(key: str, node: Any) -> Any:
     return node
 
 
-# -- types ---------------------------------------------------------------------------------------------------------
-
-
 def hint_at(schema: type, parts: Sequence[str]) -> Any:
     """Return the type of a field of a dataclass, with its range; None: there is no such field."""
     hint = get_type_hints(schema, include_extras=True).get(parts[0])
