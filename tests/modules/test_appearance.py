@@ -119,7 +119,7 @@ def test_they_learn_and_go_on_from_a_checkpoint() -> None:
             (rendered - target).square().mean().backward()
             module.optimizer_step(step)
 
-    modules[0].start(*principal_codes(0.1 * noise(2, NUMBERS), 2))
+    modules[0].start(**dict(zip(("codes", "decoder"), principal_codes(0.1 * noise(2, NUMBERS), 2), strict=True)))
     learn(modules[0], 201, 240)
     modules[1].load_state_dict({name: value.clone() for name, value in modules[0].state_dict().items()})
     for module in modules:

@@ -152,7 +152,7 @@ def test_grids_are_learnt_and_go_on_from_what_was_kept() -> None:
     image = 0.2 + 0.3 * noise(3, 12, 16)
     truth = without_common(0.2 * noise(2, RANK, 3, 4, seed=3))
     found = exposure_of(2, 200, rate_final=0.001)
-    found.start(torch.eye(3, 4).repeat(2, 1, 1), initial_grids(torch.zeros(2, 2, 3)))
+    found.start(matrices=torch.eye(3, 4).repeat(2, 1, 1), grids=initial_grids(torch.zeros(2, 2, 3)))
 
     def go_on(module: Exposure, first: int, last: int) -> float:
         for step in range(first, last):

@@ -113,7 +113,7 @@ def test_they_are_corrected_by_what_a_better_model_renders() -> None:
         ratio = exposed(module, image, index) / image
         torch.testing.assert_close(ratio, torch.full_like(ratio, float(gain)), atol=0.02, rtol=0)
     assert module.visits.sum() == 0
-    assert module.moments.abs().max() == 0
+    assert module.moments["matrices"].abs().max() == 0
     assert not module.due(275)
     assert module.due(375)
 
@@ -122,7 +122,7 @@ def test_what_is_learnt_stays_where_photos_say_nothing_more() -> None:
     truth = torch.eye(3, 4).repeat(2, 1, 1)
     truth[0, 0, 1], truth[1, 0, 1] = 0.05, -0.05  # no gain: a channel that takes from another
     image, module = 0.2 + 0.3 * noise(3, 16, 24), exposure_of(views=2)
-    module.start(truth.clone())
+    module.start(matrices=truth.clone())
     pairs = [(exposed(module, image, 0),) * 2, (exposed(module, image, 1), torch.zeros_like(image))]
     assert module.correct(lambda index: light_of((*pairs[index], None), False), 275) == 0
     assert module.matrices is not None
@@ -132,7 +132,7 @@ def test_what_is_learnt_stays_where_photos_say_nothing_more() -> None:
 def test_a_common_gain_is_the_models_and_changes_no_photo() -> None:
     truth = torch.tensor([0.7, 1.0, 1.3])[:, None, None] * torch.eye(3, 4)
     image, module = 0.2 + 0.3 * noise(3, 16, 24), exposure_of(views=3)
-    module.start(truth.clone())
+    module.start(matrices=truth.clone())
     renders = [exposed(module, image, index) for index in range(3)]
     pairs = [(image, gain * image, None) for image, gain in zip(renders, (1.15, 1.15, 0), strict=True)]
     assert module.correct(measure_of(pairs), 275) < 1e-6  # the third photo is black
@@ -164,7 +164,7 @@ def test_a_sample_of_photos_is_tested_and_the_others_measured_where_all_get_expo
 
 def test_a_render_that_is_looked_at_teaches_nothing() -> None:
     image, module = 0.2 + 0.3 * noise(3, 16, 24), exposure_of(views=2, iterations=100)
-    module.start(torch.eye(3, 4).repeat(2, 1, 1))
+    module.start(matrices=torch.eye(3, 4).repeat(2, 1, 1))
     assert module.expose(image, 0, learning=True).requires_grad
     assert not module.expose(image, 1).requires_grad
     assert module.rendered == {0}
@@ -174,7 +174,7 @@ def test_they_are_learnt_and_go_on_from_a_checkpoint() -> None:
     image, truth = 0.2 + 0.3 * noise(3, 16, 24), torch.eye(3, 4).repeat(2, 1, 1)
     truth[0, 0, 3], truth[1, 0, 3] = 0.1, -0.1
     module, other = (exposure_of(views=2, iterations=100, rate_final=0.01) for _ in range(2))
-    module.start(torch.eye(3, 4).repeat(2, 1, 1))
+    module.start(matrices=torch.eye(3, 4).repeat(2, 1, 1))
 
     def learn(exposure: Exposure, first: int, last: int) -> None:
         for step in range(first, last):
@@ -199,7 +199,7 @@ def test_adam_steps_each_photo_apart_by_a_rate_that_falls() -> None:
     assert [module.options.rate_at(step, 1000) for step in (200, 600, 1000)] == pytest.approx(
         [0.01, math.sqrt(1e-5), 0.001]
     )
-    module.start(torch.eye(3, 4).repeat(4, 1, 1))
+    module.start(matrices=torch.eye(3, 4).repeat(4, 1, 1))
     image, identity = 0.2 + 0.3 * noise(3, 16, 24), torch.eye(3, 4)
     module.expose(image, 0, learning=True).sum().backward()
     module.optimizer_step(200)  # Adam's first step is one rate: down, and up by a quarter of it to keep the mean
@@ -217,7 +217,7 @@ def test_more_than_a_saturated_value_is_no_error() -> None:
     module, image = exposure_of(views=1), torch.tensor([0.4, 1.3, 1.3]).view(3, 1, 1).requires_grad_()
     photo, [view] = torch.tensor([1.0, 1.0, 0.9]).view(3, 1, 1), module.context.scene.train
     assert module.transform_render(image, view, photo, None, learning=True) is image
-    module.start(torch.eye(3, 4)[None])
+    module.start(matrices=torch.eye(3, 4)[None])
     (module.transform_render(image, view, photo, None, learning=True) - photo).abs().sum().backward()
     assert image.grad is not None
     assert image.grad.flatten().tolist() == [-1, 0, 1]

@@ -18,17 +18,15 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Range
 from gsx.core.shapes import Bool, Float
-from gsx.core.training.module import ModuleContext
 from gsx.core.training.run import Run
 from gsx.modules.bilateral_grid import WHOLE
 from gsx.modules.colour_response import NUMBERS, fit_code, light_fields, principal_codes, respond
-from gsx.modules.corrections import Correction, Times, ViewCount, log_test, percent, sample
+from gsx.modules.corrections import Times, ViewCount, log_test, percent, sample
 from gsx.modules.exposure import (
     EQUAL,
+    LearnedCorrection,
     LearnedOptions,
-    adam_direction,
     light_of,
-    numbers_of,
     photo_pair,
     spreads_of,
     within_range,
@@ -60,7 +58,7 @@ class AppearanceOptions(LearnedOptions):
     """Most photos that the test uses."""
 
 
-class Appearance(Correction):
+class Appearance(LearnedCorrection):
     """Appearance of each photo: a code of a few numbers, and a linear decoder that all photos share."""
 
     options: AppearanceOptions
@@ -68,18 +66,7 @@ class Appearance(Correction):
     figures_key = "appearance"
     count_key = "appearances"
 
-    def __init__(self, options: AppearanceOptions, context: ModuleContext) -> None:
-        super().__init__(options, context)
-        self.indices = numbers_of(context.scene.train)
-        """Number of a photo by its name; of photos of one name the first."""
-        self.learned: dict[str, Tensor] = {}
-        """`codes` [N C] and `decoder` [14 C]; empty: photos do not differ."""
-        self.moments: dict[str, Tensor] = {}
-        """Adam's means of gradients and of their squares, by the same names."""
-        self.visits: Float[Tensor, N] = torch.zeros(len(context.scene.train))
-        """Steps of each photo."""
-        self.rendered: set[int] = set()
-        """Photos of the step under way."""
+    moment_names: ClassVar[Mapping[str, str]] = {"codes": "adam.codes", "decoder": "adam.decoder"}
 
     # -- estimates -----------------------------------------------------------------------------------------------------
 
@@ -108,18 +95,12 @@ class Appearance(Correction):
         """Restarts learning from the measured responses of all photos."""
         count = len(self.visits)
         numbers = torch.stack([response_of(measure(index)) for index in range(count)])
-        self.start(*principal_codes(numbers, self.options.size))
+        codes, decoder = principal_codes(numbers, self.options.size)
+        self.start(codes=codes, decoder=decoder)
         self.last_estimate = step
         size = self.learned["codes"].shape[1]
         logger.info("step %d: appearance of %d photos measured, %d numbers each", step, count, size)
         return {self.count_key: count, "appearance_numbers": size}
-
-    def start(self, codes: Float[Tensor, "N C"], decoder: Float[Tensor, "14 C"]) -> None:
-        """Starts learning from these codes and this decoder."""
-        device = self.context.device
-        self.learned = {"codes": codes.to(device).requires_grad_(), "decoder": decoder.to(device).requires_grad_()}
-        self.moments = {name: torch.zeros(2, *value.shape, device=device) for name, value in self.learned.items()}
-        self.visits = torch.zeros(len(codes))
 
     # -- learning ------------------------------------------------------------------------------------------------------
 
@@ -139,26 +120,14 @@ class Appearance(Correction):
     @torch.no_grad()
     def optimizer_step(self, step: int) -> None:
         """Takes a step of Adam for the decoder and the codes of rendered photos; keeps the mean code 0."""
-        if not self.rendered:
-            return
-        rate = self.options.rate_at(step, self.context.iterations)
-        codes, decoder = self.learned.values()
-        if codes.grad is None or decoder.grad is None:
+        if not self.has_gradients():
             return
         for index in sorted(self.rendered):
             self.visits[index] += 1
-            codes[index] -= rate * adam_direction(
-                self.moments["codes"][:, index], codes.grad[index], float(self.visits[index])
-            )
-        decoder -= rate * adam_direction(self.moments["decoder"], decoder.grad, float(self.visits.sum()))
-        codes -= codes.mean(0)
+            self.take_adam_step("codes", index, float(self.visits[index]), step)
+        self.take_adam_step("decoder", ..., float(self.visits.sum()), step)
+        self.learned["codes"] -= self.learned["codes"].mean(0)
         self.zero_grad()
-
-    def zero_grad(self) -> None:
-        """Drops the gradients of a step."""
-        self.rendered.clear()
-        for value in self.learned.values():
-            value.grad = None
 
     @torch.no_grad()
     def fit_render(
@@ -172,25 +141,6 @@ class Appearance(Correction):
         image = image.to(decoder.device)
         code = fit_code(image, photo, fitted, decoder, spread**-2)
         return respond(image, light_fields(image), decoder @ code)
-
-    # -- files ---------------------------------------------------------------------------------------------------------
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Returns codes, decoder and Adam's state; empty without codes."""
-        if not self.learned:
-            return {}
-        tensors = {name: value.detach() for name, value in self.learned.items()}
-        tensors |= {f"adam.{name}": value for name, value in self.moments.items()}
-        return tensors | {"visits": self.visits, "last_estimate": torch.tensor(self.last_estimate)}
-
-    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restores a checkpoint; empty: there are no codes."""
-        self.learned, self.moments, self.last_estimate = {}, {}, 0
-        if not tensors:
-            return
-        self.start(tensors["codes"].clone(), tensors["decoder"].clone())
-        self.moments = {name: tensors[f"adam.{name}"].to(self.context.device).clone() for name in self.learned}
-        self.visits, self.last_estimate = tensors["visits"].clone(), int(tensors["last_estimate"])
 
     @classmethod
     def figures(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -121,33 +121,105 @@ def relative_gains(lights: Sequence[Light]) -> Float[Tensor, "N 3"]:
     return (gains - gains.nanmean(0)).nan_to_num(0.0)
 
 
+# -- learning ----------------------------------------------------------------------------------------------------------
+
+
+class LearnedCorrection(Correction):
+    """Correction with values of each photo that Adam learns; it counts the steps of each photo."""
+
+    options: LearnedOptions
+    moment_names: ClassVar[Mapping[str, str]]
+    """Names of Adam's moments in checkpoints, by the names of learned values."""
+    last_name: ClassVar[str] = "last_estimate"
+    """Name of the last estimate's step in checkpoints."""
+
+    def __init__(self, options: Any, context: ModuleContext) -> None:
+        super().__init__(options, context)
+        self.indices = {view.name: index for index, view in reversed([*enumerate(context.scene.train)])}
+        """Number of a photo by its name; of photos of one name the first."""
+        self.learned: dict[str, Tensor] = {}
+        """Learned values by name; empty: photos do not differ."""
+        self.moments: dict[str, Tensor] = {}
+        """Adam's means of gradients and of their squares, by the same names."""
+        self.visits: Float[Tensor, N] = torch.zeros(len(context.scene.train))
+        """Steps of each photo."""
+        self.rendered: set[int] = set()
+        """Photos of the step under way."""
+
+    def start(self, **values: Tensor) -> None:
+        """Starts learning from these values."""
+        device = self.context.device
+        self.learned = {name: value.to(device).requires_grad_() for name, value in values.items()}
+        self.moments = {name: torch.zeros(2, *value.shape, device=device) for name, value in values.items()}
+        self.visits = torch.zeros_like(self.visits)
+
+    def has_gradients(self) -> bool:
+        """Checks if the step under way has rendered photos and sent gradients back."""
+        return bool(self.rendered) and all(value.grad is not None for value in self.learned.values())
+
+    def take_adam_step(self, name: str, index: Any, steps: float, step: int) -> None:
+        """Changes a learned value, or its part at an index, by Adam."""
+        value = self.learned[name]
+        assert value.grad is not None
+        direction = adam_direction(self.moments[name][:, index], value.grad[index], steps)
+        value[index] -= self.options.rate_at(step, self.context.iterations) * direction
+
+    def zero_grad(self) -> None:
+        """Drops the gradients of a step."""
+        self.rendered.clear()
+        for value in self.learned.values():
+            value.grad = None
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Returns learned values and Adam's state; empty without values."""
+        if not self.learned:
+            return {}
+        tensors = {name: value.detach() for name, value in self.learned.items()}
+        tensors |= {self.moment_names[name]: value for name, value in self.moments.items()}
+        return tensors | {"visits": self.visits, self.last_name: torch.tensor(self.last_estimate)}
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restores a checkpoint; empty: there are no values."""
+        self.learned, self.moments, self.last_estimate = {}, {}, 0
+        if tensors:
+            self.start(**{name: tensors[name].clone() for name in self.moment_names if name in tensors})
+            device = self.context.device
+            self.moments = {name: tensors[self.moment_names[name]].to(device).clone() for name in self.learned}
+            self.visits = tensors["visits"].clone()
+            self.last_estimate = int(tensors.get(self.last_name, 0))  # older checkpoints lack it
+
+
+def adam_direction(moments: Float[Tensor, "2 *S"], gradient: Float[Tensor, "*S"], steps: float) -> Float[Tensor, "*S"]:
+    """Returns Adam's direction at a photo's step number `steps`; updates its moments in place."""
+    means = []
+    for moment, beta, value in zip(moments, BETAS, (gradient, gradient.square()), strict=True):
+        moment.mul_(beta).add_((1 - beta) * value)
+        means.append(moment / (1 - beta**steps))
+    return means[0] / (means[1].sqrt() + EPS)
+
+
 # -- the module --------------------------------------------------------------------------------------------------------
 
 
-class Exposure(Correction):
+class Exposure(LearnedCorrection):
     """Per-photo exposure: one 3x4 colour matrix, and a bilateral grid where light differs within photos."""
 
     options: ExposureOptions
     seconds_key = "exposure_seconds"
     figures_key = "exposures"
     count_key = "exposures"
+    moment_names: ClassVar[Mapping[str, str]] = {"matrices": "moments", "grids": "grid_moments"}
+    last_name = "told_last"
 
-    def __init__(self, options: ExposureOptions, context: ModuleContext) -> None:
-        super().__init__(options, context)
-        self.count = len(context.scene.train)
-        self.indices = numbers_of(context.scene.train)
-        """Number of a photo by its name; of photos of one name the first."""
-        self.matrices: Float[Tensor, "N 3 4"] | None = None
-        """None: photos do not differ."""
-        self.moments: Float[Tensor, "2 N 3 4"] = torch.zeros(2, 0, 3, 4)
-        """Adam's means of gradients and of their squares."""
-        self.grids: Float[Tensor, "N rank 3 4"] | None = None
-        """Matrices of bilateral grids; None: light does not differ within photos."""
-        self.grid_moments: Float[Tensor, "2 N rank 3 4"] = torch.zeros(2, 0, 0, 3, 4)
-        self.visits: Float[Tensor, N] = torch.zeros(0)
-        """Steps of each photo."""
-        self.rendered: set[int] = set()
-        """Photos of the step under way."""
+    @property
+    def matrices(self) -> Float[Tensor, "N 3 4"] | None:
+        """Returns the matrices; None: photos do not differ."""
+        return self.learned.get("matrices")
+
+    @property
+    def grids(self) -> Float[Tensor, "N rank 3 4"] | None:
+        """Returns the matrices of bilateral grids; None: light does not differ within photos."""
+        return self.learned.get("grids")
 
     def due(self, step: int) -> bool:
         """Checks if exposures are estimated before a step: with grids only once, since gains know less."""
@@ -166,14 +238,14 @@ class Exposure(Correction):
             return log_tests(self, step, *self.test(measure, step))
         change = self.correct(measure, step)
         logger.info("step %d: exposures re-estimated, RMS change %.1f %%", step, 100 * change)
-        return {"exposures": self.count, "exposure_motion": change}
+        return {"exposures": len(self.visits), "exposure_motion": change}
 
     def test(self, measure: Measure, step: int) -> tuple[float, float]:
         """Measures some photos, and starts from the gains of all if they differ.
 
         Returns the spreads of gains and of slopes; nan where grids are off.
         """
-        options, everyone = self.options, range(self.count)
+        options, everyone = self.options, range(len(self.visits))
         lights = {index: measure(index) for index in sample(everyone, options.views, "exposures")}
         spread, within = spreads_of(list(lights.values()))
         with_grids = options.grid == "always" or within > options.grid_spread
@@ -184,7 +256,7 @@ class Exposure(Correction):
 
     def correct(self, measure: Measure, step: int) -> float:
         """Corrects the exposures; returns their RMS error, of log gains."""
-        lights = [measure(index) for index in range(self.count)]
+        lights = [measure(index) for index in range(len(self.visits))]
         self.restart(lights, with_grids=False, step=step)
         return float(relative_gains(lights).square().mean().sqrt())
 
@@ -192,19 +264,11 @@ class Exposure(Correction):
     def restart(self, lights: Sequence[Light], with_grids: bool, step: int) -> None:
         """Restarts learning from the present exposures times the gains of the photos."""
         gains = relative_gains(lights).exp()
-        now = torch.eye(3, 4).expand(self.count, -1, -1) if self.matrices is None else self.matrices.cpu()
+        now = torch.eye(3, 4).expand(len(self.visits), -1, -1) if self.matrices is None else self.matrices.cpu()
         slopes = [light.slopes[0] for light in lights if with_grids and light.slopes is not None]
-        grids = initial_grids(torch.stack(slopes)) if slopes else None
-        self.start(centred_on_identity(gains[:, :, None] * now), grids)
+        grids = {"grids": initial_grids(torch.stack(slopes))} if slopes else {}
+        self.start(matrices=centred_on_identity(gains[:, :, None] * now), **grids)
         self.last_estimate = step
-
-    def start(self, matrices: Float[Tensor, "N 3 4"], grids: Float[Tensor, "N rank 3 4"] | None = None) -> None:
-        """Starts learning from these exposures and grids."""
-        device = self.context.device
-        self.matrices = matrices.to(device).requires_grad_()
-        self.moments, self.visits = torch.zeros(2, *matrices.shape, device=device), torch.zeros(len(matrices))
-        self.grids = None if grids is None else grids.to(device).requires_grad_()
-        self.grid_moments = torch.zeros(2, *(() if grids is None else grids.shape), device=device)
 
     # -- learning ------------------------------------------------------------------------------------------------------
 
@@ -229,50 +293,16 @@ class Exposure(Correction):
     @torch.no_grad()
     def optimizer_step(self, step: int) -> None:
         """Takes a step of Adam for each rendered photo; keeps the mean exposure the identity."""
-        if self.matrices is None or self.matrices.grad is None:
+        if not self.has_gradients():
             return
-        learnt = [(self.matrices, self.moments), (self.grids, self.grid_moments)]
         for index in sorted(self.rendered):
             self.visits[index] += 1
-            for values, moments in learnt:
-                if values is not None and values.grad is not None:
-                    direction = adam_direction(moments[:, index], values.grad[index], float(self.visits[index]))
-                    values[index] -= self.options.rate_at(step, self.context.iterations) * direction
-        self.matrices.copy_(centred_on_identity(self.matrices))
+            for name in self.learned:
+                self.take_adam_step(name, index, float(self.visits[index]), step)
+        self.learned["matrices"].copy_(centred_on_identity(self.learned["matrices"]))
         if self.grids is not None:
             self.grids.copy_(without_common(self.grids))
         self.zero_grad()
-
-    def zero_grad(self) -> None:
-        """Drops the gradients of a step."""
-        self.rendered.clear()
-        for values in (self.matrices, self.grids):
-            if values is not None:
-                values.grad = None
-
-    # -- files ---------------------------------------------------------------------------------------------------------
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Returns exposures and Adam's state; empty without exposures."""
-        if self.matrices is None:
-            return {}
-        tensors = {"matrices": self.matrices.detach(), "moments": self.moments, "visits": self.visits}
-        tensors["told_last"] = torch.tensor(self.last_estimate)
-        if self.grids is None:
-            return tensors
-        return tensors | {"grids": self.grids.detach(), "grid_moments": self.grid_moments}
-
-    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restores a checkpoint; empty: there are no exposures."""
-        self.matrices, self.grids, self.last_estimate = None, None, 0
-        if not tensors:
-            return
-        self.last_estimate = int(tensors.get("told_last", 0))  # older checkpoints lack it
-        grids = tensors.get("grids")
-        self.start(tensors["matrices"].clone(), None if grids is None else grids.clone())
-        self.moments, self.visits = tensors["moments"].to(self.context.device).clone(), tensors["visits"].clone()
-        if grids is not None:
-            self.grid_moments = tensors["grid_moments"].to(self.context.device).clone()
 
     @classmethod
     def figures(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -299,11 +329,6 @@ class Exposure(Correction):
             )
 
 
-def numbers_of(views: Sequence[View]) -> dict[str, int]:
-    """Returns the number of each photo by its name, of photos of one name that of the first."""
-    return {view.name: index for index, view in reversed([*enumerate(views)])}
-
-
 def within_range(image: Float[Tensor, "3 H W"], photo: Float[Tensor, "3 H W"] | None) -> Float[Tensor, "3 H W"]:
     """Returns a render to compare with its photo: the photo where that is saturated and the render brighter."""
     return image if photo is None else torch.where((photo >= 1) & (image > 1), photo, image)
@@ -325,21 +350,12 @@ def log_tests(module: Exposure, step: int, spread: float, within: float) -> dict
     options, active, grids = module.options, module.active, module.grids is not None
     action = "learning one per photo" if active else EQUAL
     log_test(step, "exposure spread", spread, options.spread, percent, action)
-    metrics = {"exposure_spread": spread, "exposures": module.count if active else 0}
+    metrics = {"exposure_spread": spread, "exposures": len(module.visits) if active else 0}
     if math.isnan(within):
         return metrics
     action = "learning grids" if grids else EQUAL
     log_test(step, "light spread within photos", within, options.grid_spread, percent, action)
-    return metrics | {"light_spread": within, "grids": module.count if grids else 0}
-
-
-def adam_direction(moments: Float[Tensor, "2 *S"], gradient: Float[Tensor, "*S"], steps: float) -> Float[Tensor, "*S"]:
-    """Returns Adam's direction at a photo's step number `steps`; updates its moments in place."""
-    means = []
-    for moment, beta, value in zip(moments, BETAS, (gradient, gradient.square()), strict=True):
-        moment.mul_(beta).add_((1 - beta) * value)
-        means.append(moment / (1 - beta**steps))
-    return means[0] / (means[1].sqrt() + EPS)
+    return metrics | {"light_spread": within, "grids": len(module.visits) if grids else 0}
 
 
 def centred_on_identity(matrices: Float[Tensor, "N 3 4"]) -> Float[Tensor, "N 3 4"]:
