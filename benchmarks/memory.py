@@ -36,11 +36,11 @@ RESULTS = Path(__file__).parent / "results"
 PHOTOS, WIDTH, HEIGHT, POINTS = 500, 1600, 1200, 100_000
 SUBJECTS = {
     "fox": ["scene=colmap", "scene.downscale=4", "iterations=600"],
-    "many": ["scene=transforms", "scene.split=none", "iterations=20"],
-    "many_plain": ["scene=transforms", "scene.split=none", "iterations=20", "training.supersampling.factor=1"],
+    "many": ["scene=transforms", "scene.split=none", "iterations=20", "rasterizer=compiled"],
+    "many_eager": ["scene=transforms", "scene.split=none", "iterations=20", "rasterizer=eager"],
 }
-"""Settings by scene; those of `many` are the shortest run with steps of all sizes."""
-MADE = ("many", "many_plain")
+"""Settings by scene; those of `many` are the shortest run with steps of all sizes, and the rasterizer of longer runs."""
+MADE = ("many", "many_eager")
 """Scenes that are made here."""
 PHASES = ("start", "steps", "finer steps", "evaluation")
 COLUMNS = [["scene", "scene"], *([phase, f"{phase}, MB"] for phase in PHASES), ["peak", "peak, MB"]]
