@@ -34,12 +34,13 @@ from measuring.revisions import checked_out
 
 RESULTS = Path(__file__).parent / "results"
 PHOTOS, WIDTH, HEIGHT, POINTS = 500, 1600, 1200, 100_000
+CAPTURE = ["scene=transforms", "scene.split=none"]
 SUBJECTS = {
     "fox": ["scene=colmap", "scene.downscale=4", "iterations=600"],
-    "many": ["scene=transforms", "scene.split=none", "iterations=20", "rasterizer=compiled"],
-    "many_eager": ["scene=transforms", "scene.split=none", "iterations=20", "rasterizer=eager"],
+    "many": [*CAPTURE, "iterations=20", "rasterizer=compiled"],
+    "many_eager": [*CAPTURE, "iterations=10", "rasterizer=eager"],
 }
-"""Settings by scene; those of `many` are the shortest run with steps of all sizes, and the rasterizer of longer runs."""
+"""Settings by scene; those of `many` have few steps of both sizes, by the rasterizer that longer runs choose."""
 MADE = ("many", "many_eager")
 """Scenes that are made here."""
 PHASES = ("start", "steps", "finer steps", "evaluation")
@@ -146,15 +147,15 @@ def main(words: Sequence[str]) -> None:
         return print_peaks(json.loads(options.peaks_of))
     if reason := unmeasurable(torch.device("cpu")):
         raise SystemExit(reason)
-    load, rows, names = told_load(), list[dict[str, Any]](), options.only.split(",")
+    sections, command = dict[str, Any](), shown_command(words, "benchmarks/memory.py")
     with checked_out(options.against) if options.against else nullcontext() as old:
-        for name in names:
-            sources = {name: ROOT / "src"} | ({f"{name}, {options.against}": old} if old else {})
-            rows += [row_of(name, source, options.scenes, label) for label, source in sources.items()]
-    notes = [NOTE, *(f"{name}: `gsx {' '.join(SUBJECTS[name])}`." for name in names)]
-    section = stamped("Peak memory", COLUMNS, rows, notes, load, shown_command(words, "benchmarks/memory.py"))
-    write_results(RESULTS, "memory_cpu", describe_machine(torch.device("cpu")), {"process": section})
-    print(text_table(section))
+        for name in options.only.split(","):
+            load, sources = told_load(), {name: ROOT / "src"} | ({f"{name}, {options.against}": old} if old else {})
+            rows = [row_of(name, source, options.scenes, label) for label, source in sources.items()]
+            notes = [NOTE, f"{name}: `gsx {' '.join(SUBJECTS[name])}`."]
+            sections[name] = stamped(f"Peak memory: {name}", COLUMNS, rows, notes, load, command)
+    write_results(RESULTS, "memory_cpu", describe_machine(torch.device("cpu")), sections)
+    print(*map(text_table, sections.values()), sep="\n")
 
 
 if __name__ == "__main__":
