@@ -221,6 +221,8 @@ def test_without_need_training_is_bit_for_bit_that_without_the_question(tmp_path
     judged = tiny_run(tmp_path / "judged", [*short, *asked])
     assert not plain.modules["distractors"].active
     assert not judged.modules["distractors"].active
+    summary = judged.modules["distractors"].summary(judged.progress.curves)["distractors"]
+    assert (summary["thresholds"], summary["marked"]) == ({"share": 0.9}, [])
     assert [line["distractors"] for line in judged.progress.curves if "distractor_share" in line] == [0]
     a, b = final_tensors(tmp_path / "plain"), final_tensors(tmp_path / "judged")
     assert a.keys() == b.keys()

@@ -143,7 +143,9 @@ def test_the_better_stretch_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert run.complete
     assert run.modules["exposure"].active == (gain > 0)
     evaluation = run_evaluation(tmp_path)
-    assert evaluation["trials"]["exposure"]["gain"] == gain
+    trial = evaluation["trials"]["exposure"]
+    assert (trial["gain"], trial["threshold"], trial["stays"]) == (gain, 0.8, gain > 0)
+    assert evaluation["exposures"]["thresholds"] == {"spread": 0.06, "grid_spread": 0.08}
     assert (evaluation["exposures"]["learnt"] > 0) == (gain > 0)
 
 

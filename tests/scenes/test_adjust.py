@@ -114,6 +114,7 @@ def test_what_fits_is_left_alone_bit_for_bit(tmp_path: Path, cache: Path) -> Non
     write_scene(synthesize(), tmp_path)
     given, asked = load(colmap_options(tmp_path)), load(colmap_options(tmp_path, adjust="auto"))
     assert asked.notes[0].startswith("Nothing is adjusted: pictures are 0.00 px off")
+    assert asked.notes[0].endswith("(scene.adjust=auto, threshold 0.25 px).")
     for one, other in zip(given.train, asked.train, strict=True):
         assert one.camera.draws_as(other.camera)
     assert torch.equal(given.points.positions, asked.points.positions)

@@ -65,7 +65,8 @@ def sky_behind(scene: Scene, when: str) -> Sky:
     sky = sky_of(scene)
     behind = when == "always" or sky.share >= OPEN
     verdict = f"adding {len(sky.points):,} distant Gaussians" if behind else "adding none"
-    logger.info("sky: %.1f %% of the pixels of training views are open, %s", 100 * sky.share, verdict)
+    sign = ">=" if sky.share >= OPEN else "<"
+    logger.info("sky: open pixels of training views %.1f %% %s %g %%, %s", 100 * sky.share, sign, 100 * OPEN, verdict)
     return sky if behind else NOTHING
 
 

@@ -65,6 +65,7 @@ class Appearance(LearnedCorrection):
     seconds_key = "appearance_seconds"
     figures_key = "appearance"
     count_key = "appearances"
+    thresholds = ("spread", "light_spread")
 
     moment_names: ClassVar[Mapping[str, str]] = {"codes": "adam.codes", "decoder": "adam.decoder"}
 

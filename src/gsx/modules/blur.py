@@ -57,6 +57,7 @@ class Blur(Correction):
     seconds_key = "blur_seconds"
     figures_key = "blur"
     count_key = "blurred"
+    thresholds = ("sharpness", "length", "explained")
 
     def __init__(self, options: BlurOptions, context: ModuleContext) -> None:
         super().__init__(options, context)
@@ -76,7 +77,8 @@ class Blur(Correction):
         middle = {"blur_length": median(lengths)} if lengths else {}
         length = f", median movement {median(lengths):.1f} px" if lengths else ""
         logger.info(
-            "step %d: %d of %d candidate photos are motion-blurred%s", step, len(lengths), len(candidates), length
+            "step %d: %d of %d candidate photos (sharpness < %g) moved by >= %g px%s",
+            *(step, len(lengths), len(candidates), self.options.sharpness, self.options.length, length),
         )
         return {"blurred": len(lengths), "blur_suspects": len(candidates)} | middle
 

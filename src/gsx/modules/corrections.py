@@ -17,6 +17,8 @@ from gsx.core.training.run import Run
 logger = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
+LIMIT = "_threshold_"
+"""Between the key of figures and the option of a threshold, in metrics.jsonl."""
 WHEN = ("never", "auto", "always")
 """auto: correct after a test; always: correct without one."""
 Times = Annotated[int, Range(1, 1000)]
@@ -66,6 +68,8 @@ class Correction(TrainingModule):
     """Key of its figures in evaluation.json."""
     count_key: ClassVar[str]
     """Key in metrics.jsonl that is 0 where no photo is corrected."""
+    thresholds: ClassVar[Sequence[str]] = ()
+    """Options with the thresholds of `auto`."""
     last_estimate = 0
     """Step of the last estimate: repeating that step does not estimate again."""
 
@@ -85,7 +89,12 @@ class Correction(TrainingModule):
             return {}
         start = time.perf_counter()
         metrics = self.estimate(run, step)
-        return metrics | {self.seconds_key: round(time.perf_counter() - start, 3)}
+        return metrics | self.limits(step) | {self.seconds_key: round(time.perf_counter() - start, 3)}
+
+    def limits(self, step: int) -> dict[str, float]:
+        """Returns the thresholds of the test before a step; none if there is no test."""
+        tested = self.options.when == "auto" and step == self.milestones()[0]
+        return {f"{self.figures_key}{LIMIT}{name}": getattr(self.options, name) for name in self.thresholds if tested}
 
     def due(self, step: int) -> bool:
         """Checks if it is estimated before a step: before the first of its steps, then only if it is active."""
@@ -111,12 +120,14 @@ class Correction(TrainingModule):
 
     @classmethod
     def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """Returns the figures of its estimates and their seconds; a stop before a step loses its line."""
+        """Returns the figures of its estimates, thresholds and seconds; a stop before a step loses its line."""
         estimates = [line for line in lines if cls.seconds_key in line]
         if not estimates:
             return {}
-        seconds = sum(line[cls.seconds_key] for line in estimates)
-        return {cls.figures_key: cls.figures(estimates) | {"seconds": seconds}}
+        seconds, start = sum(line[cls.seconds_key] for line in estimates), cls.figures_key + LIMIT
+        limits = {key.removeprefix(start): value for key, value in estimates[0].items() if key.startswith(start)}
+        tested = {"thresholds": limits} if limits else {}
+        return {cls.figures_key: cls.figures(estimates) | tested | {"seconds": seconds}}
 
 
 @dataclass(eq=False)

@@ -61,6 +61,7 @@ class Distractors(Correction):
     seconds_key = "distractor_seconds"
     figures_key = "distractors"
     count_key = "distractors"
+    thresholds = ("share",)
     in_views = True
 
     def __init__(self, options: DistractorOptions, context: ModuleContext) -> None:

@@ -210,6 +210,7 @@ class Exposure(LearnedCorrection):
     count_key = "exposures"
     moment_names: ClassVar[Mapping[str, str]] = {"matrices": "moments", "grids": "grid_moments"}
     last_name = "told_last"
+    thresholds = ("spread", "grid_spread")
 
     @property
     def matrices(self) -> Float[Tensor, "N 3 4"] | None:

@@ -62,6 +62,7 @@ class Poses(Correction):
     seconds_key = "pose_seconds"
     figures_key = "poses"
     count_key = "poses"
+    thresholds = ("spread",)
     in_views = True
 
     def __init__(self, options: PoseOptions, context: ModuleContext) -> None:

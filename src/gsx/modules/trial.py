@@ -211,9 +211,9 @@ class Trial(TrainingModule):
 
     @classmethod
     def summary(cls, lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """Returns the gains of trials by correction, dB, with their standard errors."""
+        """Returns the gains of trials by correction, dB, their standard errors and thresholds, and the outcomes."""
         trials = {
-            key.removesuffix(GAIN): {"step": line["step"], "gain": line[key], "error": line[key + ERROR]}
+            key.removesuffix(GAIN): {"step": line["step"]} | outcome_of(line[key], line[key + ERROR])
             for line in lines
             for key in line
             if key.endswith(GAIN)
@@ -278,6 +278,11 @@ def log_trial(name: str, step: int, length: int, gain: float, error: float) -> N
         "step %d: %s tried for %d steps, gain on masked windows %+.2f dB %s %d standard errors of %.2f dB: %s",
         *(step, name, length, gain, sign, SURE, error, outcome),
     )
+
+
+def outcome_of(gain: float, error: float) -> dict[str, Any]:
+    """Returns a gain, its standard error, its threshold and whether the correction stays."""
+    return {"gain": gain, "error": error, "threshold": SURE * error, "stays": helps(gain, error)}
 
 
 def helps(gain: float, error: float) -> bool:

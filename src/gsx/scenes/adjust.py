@@ -42,12 +42,15 @@ def adjust_model(model: Model, when: str, photos: Path) -> tuple[Model, list[str
     chosen = decide(model, proposed) if proposed else Decision()
     notes = [f"Cameras: {chosen.words}."] if proposed else []
     if when == "auto" and not chosen.name and not (before is not None and before > SHIFT):
-        return model, [f"Nothing is adjusted: {fit_words(before)}{unmeasured(model)} (scene.adjust=auto).", *notes]
+        return model, [
+            f"Nothing is adjusted: {fit_words(before)}{unmeasured(model)} ({test_words(when, before)}).",
+            *notes,
+        ]
     after = adjusted_model(model, proposed, chosen)
     lens = f", {chosen.name}" if chosen.name else ""
     return after, [
         *(note for note in model.notes if note not in after.notes),
-        f"Bundle adjustment of poses, intrinsics{lens} and points (scene.adjust={when}): before it "
+        f"Bundle adjustment of poses, intrinsics{lens} and points ({test_words(when, before)}): before it "
         f"{fit_words(before)}, then {fit_words(shift_of(after))}{unmeasured(after)}{lens_words(model, after)}.",
         *notes,
     ]
@@ -84,6 +87,11 @@ def camera_lines(model: Model, photos: Path) -> list[str]:
 def fit_words(shift: float | None) -> str:
     """Describe how cameras fit their observations."""
     return "too few observations" if shift is None else f"pictures are {shift:.2f} px off the cameras' observations"
+
+
+def test_words(when: str, shift: float | None) -> str:
+    """Name the switch, with its threshold if there was a test."""
+    return f"scene.adjust={when}" + (f", threshold {SHIFT:g} px" if when == "auto" and shift is not None else "")
 
 
 def fit_line(model: Model) -> str:

@@ -60,6 +60,8 @@ def evaluate(run: Run, settings: Settings) -> dict[str, Any]:
     files = read_run(run.folder)
     if doubts := files.environment.get("start"):
         evaluation["start"] = doubts
+    if run.scene.notes:
+        evaluation["scene_notes"] = list(run.scene.notes)
     warn_of_paths(files.evaluation, evaluation)
     write_json(run.folder / "evaluation.json", evaluation)
     for line in [*summary(evaluation), *remedies(run, evaluation, options.remedy), *advice(evaluation, settings)]:
