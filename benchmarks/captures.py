@@ -14,7 +14,8 @@ something plain stands before a part of each training photograph, with and witho
 likewise; `passed`: somebody does in the built-in scene. `faults`: a tenth of the photographs are made worse, and what
 `gsx photographs` names is counted. `blur`: cameras move while they take photographs, with and without
 `training.blur.when=auto`, beside the scene as it is. `sky`: what plain `gsx` trains, with and without
-`backbone.sky=auto`. Finished runs below --runs are not trained again.
+`backbone.sky=auto`. `phone`: a capture as it is (office), with all corrections on `auto`, and with adjusted cameras
+and starting points by stereo. Finished runs below --runs are not trained again.
 """
 
 import argparse
@@ -28,6 +29,7 @@ from typing import Any
 
 from gsx.builtin import plugins
 from gsx.core.files import read_json
+from gsx.experiments.evaluation.view_coverage import LABELS
 from gsx.experiments.runs.degraded import choose, pair_of
 from gsx.experiments.runs.photo_check import check_photos
 from measuring.wrong_models import wrong_model
@@ -109,6 +111,15 @@ BLUR_ARMS = {
 DEFAULT = ("backbone=gs3d_zoom",)
 SKY_ARMS = {"gs3d_zoom": DEFAULT, "gs3d_zoom, sky=auto": (*DEFAULT, "backbone.sky=auto")}
 """What plain `gsx` trains, and the same with something behind the scene."""
+CORRECTIONS = (*JUDGED, *CORRECTED, *STEADIED, *UNCOVERED)
+PHONE_ARMS = {
+    "default": (),
+    "corrections, auto": CORRECTIONS,
+    "adjust, auto, and 25,000 points by stereo": (*ADJUSTED, "scene.stereo=25000"),
+}
+"""Overrides for a capture that nobody degraded."""
+DECIDED = ("exposures", "poses", "blur", "distractors")
+"""Keys of corrections in evaluation.json."""
 FEW = 0.1
 """Share of the photographs that are made worse."""
 TURNED = 3.0
@@ -495,6 +506,51 @@ def sky(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
     return "Something behind the scene", *compared(SKY_ARMS, scenes, given)
 
 
+# -- a walk with a phone -----------------------------------------------------------------------------------------------
+
+
+def walked(scene: str, seed: int, arm: str, given: argparse.Namespace) -> dict[str, Any]:
+    """Evaluation of a run in colours fitted and from poses aligned on left halves."""
+    steps = round(given.share * steps_among(SUBJECTS[scene]))
+    words = [*DEFAULT, *PHONE_ARMS[arm], *FITTED, "eval.poses=aligned", f"iterations={steps}", "eval.zoom=[1,4]"]
+    return read_json(trained(scene, seed, given, words, f"phone {arm}") / "evaluation.json")
+
+
+def phone_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, Any]:
+    """Figures of one arm over seeds, those of views by coverage, and the decisions of the first seed."""
+    found = by_arm[arm]
+    row = {
+        "scene": scene,
+        "name": arm,
+        "seeds": len(found),
+        "seconds": told([one["train_seconds"] for one in found], ".0f"),
+    }
+    row |= {f"x{zoom}": told([one["zoom"][zoom]["psnr"] for one in found], ".2f") for zoom in ZOOMS}
+    for name, group in found[0]["coverage"]["classes"].items():
+        row |= {name: group["psnr"], f"{name}_views": group["views"]}
+    row["trials"] = "; ".join(f"{key} {trial_text(one)}" for key, one in found[0].get("trials", {}).items())
+    row["decided"] = "; ".join(f"{key} {found[0][key]}" for key in DECIDED if key in found[0])
+    return row | {"notes": " ".join(note for note in found[0].get("scene_notes", []) if "adjust" in note)}
+
+
+def trial_text(trial: Mapping[str, Any]) -> str:
+    """A trial's gain with its standard error, and the outcome."""
+    return f"{trial['gain']:+.2f} ± {trial['error']:.2f} dB: {'stays' if trial['stays'] else 'taken back'}"
+
+
+def phone(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
+    """A phone's walk with corrections, adjusted cameras and more points."""
+    rows = rows_by_arm(PHONE_ARMS, walked, phone_row, scenes, given)
+    columns = [["scene", "scene"], ["name", "settings"], ["seeds", "seeds"], ["x1", "x1"], ["x4", "x4"]]
+    columns += [[key, f"{words}, x1"] for key, words in LABELS.items()] + [["trials", "trials, seed 0"]]
+    columns += [["seconds", "training s"]]
+    note = (
+        "PSNR of held-out views, dB: of right halves in colours fitted and from poses aligned by the left; means over "
+        "seeds ± half their range. By coverage: views of the first seed."
+    )
+    return "A phone walk", columns, rows, note
+
+
 # -- appearance --------------------------------------------------------------------------------------------------------
 
 
@@ -539,6 +595,7 @@ WHAT: dict[str, Measure] = {
     "faults": faults,
     "blur": blur,
     "sky": sky,
+    "phone": phone,
 }
 
 

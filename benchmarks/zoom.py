@@ -44,6 +44,7 @@ SUBJECTS = {
     "lego": ("scene=blender", "scene.downscale=4", "iterations=1200"),
     "desk_bottle": ("scene=colmap", "scene.downscale=8", "iterations=1000"),
     "castle": ("scene=photos", "scene.downscale=8", "iterations=800"),
+    "office": ("scene=colmap", "scene.downscale=4", "iterations=1000"),
     "demo": ("scene=demo", "iterations=900"),
     "room": ("scene=room", "iterations=1500"),
     "mixed": ("scene=demo", "scene.distances=mixed", "iterations=900"),
