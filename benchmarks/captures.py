@@ -14,8 +14,8 @@ something plain stands before a part of each training photograph, with and witho
 likewise; `passed`: somebody does in the built-in scene. `faults`: a tenth of the photographs are made worse, and what
 `gsx photographs` names is counted. `blur`: cameras move while they take photographs, with and without
 `training.blur.when=auto`, beside the scene as it is. `sky`: what plain `gsx` trains, with and without
-`backbone.sky=auto`. `phone`: a capture as it is (office), with all corrections on `auto`, and with adjusted cameras
-and starting points by stereo. Finished runs below --runs are not trained again.
+`backbone.sky=auto`. `phone`: a capture as it is (office), with corrections on `auto`, and
+without. Finished runs below --runs are not trained again.
 """
 
 import argparse
@@ -115,11 +115,15 @@ CORRECTIONS = (*JUDGED, *CORRECTED, *STEADIED, *UNCOVERED)
 PHONE_ARMS = {
     "default": (),
     "corrections, auto": CORRECTIONS,
-    "adjust, auto, and 25,000 points by stereo": (*ADJUSTED, "scene.stereo=25000"),
 }
 """Overrides for a capture that nobody degraded."""
-DECIDED = ("exposures", "poses", "blur", "distractors")
-"""Keys of corrections in evaluation.json."""
+TESTS = {
+    "exposures": ("spread", 100, "%"),
+    "poses": ("spread", 1, "px"),
+    "blur": ("length", 1, "px"),
+    "distractors": ("share", 100, "%"),
+}
+"""Tests of corrections: key in evaluation.json, its figure and threshold, factor and unit."""
 FEW = 0.1
 """Share of the photographs that are made worse."""
 TURNED = 3.0
@@ -529,8 +533,14 @@ def phone_row(scene: str, arm: str, by_arm: Mapping[str, Found]) -> dict[str, An
     for name, group in found[0]["coverage"]["classes"].items():
         row |= {name: group["psnr"], f"{name}_views": group["views"]}
     row["trials"] = "; ".join(f"{key} {trial_text(one)}" for key, one in found[0].get("trials", {}).items())
-    row["decided"] = "; ".join(f"{key} {found[0][key]}" for key in DECIDED if key in found[0])
-    return row | {"notes": " ".join(note for note in found[0].get("scene_notes", []) if "adjust" in note)}
+    row["tests"] = "; ".join(test_text(key, found[0][key]) for key in TESTS if key in found[0])
+    return row | {"notes": " ".join(found[0].get("scene_notes", []))}
+
+
+def test_text(key: str, figures: Mapping[str, Any]) -> str:
+    """The figure of a correction's test with its threshold."""
+    name, factor, unit = TESTS[key]
+    return f"{key} {factor * figures[name]:.2f} {unit} (threshold {factor * figures['thresholds'][name]:g} {unit})"
 
 
 def trial_text(trial: Mapping[str, Any]) -> str:
@@ -539,14 +549,14 @@ def trial_text(trial: Mapping[str, Any]) -> str:
 
 
 def phone(scenes: Sequence[str], given: argparse.Namespace) -> Measured:
-    """A phone's walk with corrections, adjusted cameras and more points."""
+    """A phone walk with corrections and without."""
     rows = rows_by_arm(PHONE_ARMS, walked, phone_row, scenes, given)
     columns = [["scene", "scene"], ["name", "settings"], ["seeds", "seeds"], ["x1", "x1"], ["x4", "x4"]]
-    columns += [[key, f"{words}, x1"] for key, words in LABELS.items()] + [["trials", "trials, seed 0"]]
+    columns += [[key, f"{words}, x1"] for key, words in LABELS.items()] + [["tests", "tests"], ["trials", "trials"]]
     columns += [["seconds", "training s"]]
     note = (
         "PSNR of held-out views, dB: of right halves in colours fitted and from poses aligned by the left; means over "
-        "seeds ± half their range. By coverage: views of the first seed."
+        "seeds ± half their range. Coverage, tests and trials: of the first seed."
     )
     return "A phone walk", columns, rows, note
 
