@@ -101,6 +101,17 @@ def no_watched_cores(tmp_path_factory):
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def groups_composed_once():
+    """Most tests that compose change values alone."""
+    import hydra
+    from composing import composed_once
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hydra, "compose", composed_once)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def shapes_of_every_test():
     """Each test has its functions' first calls checked."""

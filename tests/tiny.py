@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -15,9 +16,12 @@ from gsx.builtin import plugins
 from gsx.core.data.scene import Scene
 from gsx.core.plugins import hookimpl
 from gsx.core.training.run import Run
+from gsx.core.training.trainer import train_step
 from gsx.experiments.run_folder.files import LOG, REPORT, RESULTS, SPLATS
+from gsx.experiments.runs.build import build
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.execute import execute
+from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import open_run, start
 from gsx.experiments.runs.settings import Settings
 
@@ -83,13 +87,23 @@ def tiny_run(folder: Path, more: Sequence[str] = (), stop_after: int | None = No
     """Run the tiny experiment, interrupted after `stop_after` steps if given."""
     settings, loaded = tiny_settings(folder, *more), plugins()
     run = start(settings, loaded)
-    with loaded.listening([StopAfter(stop_after)] if stop_after is not None else []):
+    listeners = [StopAfter(stop_after)] if stop_after is not None else []
+    with loaded.listening(listeners):
         execute(run, settings, loaded, keep_states=True)
     return run
 
 
+def trained(folder: Path, steps: int, *more: str) -> Run:
+    """The run after so many steps, of which nothing is kept or evaluated."""
+    settings, loaded = tiny_settings(folder, *more), plugins()
+    run = build(settings, load_scene(settings), folder, training=True)
+    for _ in range(steps):
+        train_step(run, loaded)
+    return run
+
+
 def stopped_at(folder: Path, more: Sequence[str], *stops: int) -> Run:
-    """The run stopped after each of these steps, each time opened from its folder again, and at last run to its end."""
+    """The run stopped after these steps, opened again each time, and at last run to its end."""
     tiny_run(folder, more, stops[0])
     for stop in (*stops[1:], None):
         loaded = plugins()
@@ -103,6 +117,16 @@ def stopped_at(folder: Path, more: Sequence[str], *stops: int) -> Run:
 def final_tensors(folder: Path) -> dict[str, Tensor]:
     """All tensors of a run's newest checkpoint."""
     return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
+
+
+def same_ending(one: Path, other: Path) -> dict[str, Tensor]:
+    """Check that two runs end in the same bits; return them."""
+    ours, theirs = final_tensors(one), final_tensors(other)
+    assert ours.keys() == theirs.keys()
+    for name, tensor in ours.items():
+        assert tensor.dtype == theirs[name].dtype, name
+        assert torch.equal(tensor, theirs[name]), name
+    return ours
 
 
 EMPTY = {SPLATS: "ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n"}

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from small_scene import published_options, small_gs3d, small_scene, spread
-from tiny import LIGHT, final_tensors, tiny_run
+from tiny import LIGHT, same_ending, tiny_run
 from torch import Tensor
 
 from gsx.backbones import sky
@@ -178,9 +178,7 @@ def test_a_run_with_a_sky_resumes_as_if_never_stopped(tmp_path: Path, monkeypatc
         looking.setattr(sky, "sky_of", lambda scene: pytest.fail("a checkpoint tells what is sky"))
         run, settings = open_run(tmp_path / "stopped", plugins(), training=True)
     execute(run, settings, plugins())
-    a, b = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "stopped")
-    assert a.keys() == b.keys()
-    assert all(torch.equal(a[name], b[name]) for name in a)
+    same_ending(tmp_path / "whole", tmp_path / "stopped")
     above = ~not_sky(whole.backbone.table)
     assert 0 < int(above.sum()) < len(above)
     distances = whole.backbone.table["means"].detach().norm(dim=1)

@@ -128,17 +128,16 @@ def test_the_shipped_number_of_unrolled_splats(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_one_tile_size_after_another() -> None:
-    for tile in (8, 16):  # each compiles for itself, for any number of blocks
-        rules = replace(QUICK, tile_size=tile, unrolled=1)
-        for splats in (random_splats(250, seed=4), opaque(90, tile), random_splats(200, seed=8)):
+    for rules in (QUICK, replace(QUICK, tile_size=16, unrolled=1)):  # each compiles for any number of blocks
+        for splats in (random_splats(250, seed=4), opaque(90, rules.tile_size), random_splats(200, seed=8)):
             errors = errors_of(splats, front_camera(), rules, truth_of(splats, front_camera(), rules))
             assert errors.largest <= 1e-5
             assert errors.gradient <= 1e-4
 
 
 def test_float64_splats_are_drawn_in_float64() -> None:
-    wide = changed(random_splats(150, seed=9), dtype=torch.float64)
-    errors = errors_of(wide, front_camera(), QUICK, truth_of(wide, front_camera(), QUICK))
+    wide, rules = changed(random_splats(150, seed=9), dtype=torch.float64), replace(QUICK, unrolled=1)
+    errors = errors_of(wide, front_camera(), rules, truth_of(wide, front_camera(), rules))
     assert errors.largest <= 1e-12
     assert errors.gradient <= 1e-10
 
@@ -193,12 +192,12 @@ def test_places_of_pairs_are_only_found_for_gradients(monkeypatch: pytest.Monkey
         raise AssertionError("asked for")
 
     splats = random_splats(300, seed=4)
-    wanted = rasterize(splats, front_camera(), QUICK).image
+    wanted = rasterize(splats, front_camera(), QUICK, depth=True).image
     monkeypatch.setattr("gsx.engine.compiled.places_of", refuse)
     with torch.no_grad():
-        torch.testing.assert_close(rasterize(splats, front_camera(), QUICK).image, wanted)
+        torch.testing.assert_close(rasterize(splats, front_camera(), QUICK, depth=True).image, wanted)
     with pytest.raises(AssertionError, match="asked for"):
-        rasterize(leaves(splats), front_camera(), QUICK)
+        rasterize(leaves(splats), front_camera(), QUICK, depth=True)
 
 
 @pytest.mark.parametrize("schedule", ["chunks", "segments"])
@@ -214,7 +213,7 @@ def test_until_its_backward_pass_a_render_holds_no_lists_of_pairs(
 
     monkeypatch.setattr("gsx.core.rasterizer.render.intersect_tiles", watched)
     splats = leaves(opaque(400, 5))
-    image = rasterize(splats, front_camera(), replace(QUICK, schedule=schedule)).image
+    image = rasterize(splats, front_camera(), replace(QUICK, schedule=schedule), depth=True).image
     assert len(lists) == 3
     assert all(table() is None for table in lists)
     image.sum().backward()
@@ -238,7 +237,7 @@ def test_room_for_gradients_is_zero_where_no_slice_was_blended() -> None:
 def test_a_crop_is_the_crop_of_the_picture() -> None:
     splats, camera = random_splats(300, seed=4), front_camera()
     with torch.no_grad():
-        whole, part = (rasterize(splats, c, QUICK).image for c in (camera, camera.crop(8, 16, 24, 16)))
+        whole, part = (rasterize(splats, c, QUICK, depth=True).image for c in (camera, camera.crop(8, 16, 24, 16)))
     assert torch.equal(part, whole[:, 16:32, 8:32])
 
 

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny import tiny_run
+from tiny import trained
+from torch import Tensor
 
-from gsx.core.training.run import Run, TrainingOptions
+from gsx.core.training.run import TrainingOptions
 
 
 @pytest.mark.parametrize(
@@ -29,14 +30,15 @@ def test_paces_of_ten_steps(cooldown: float, paces: list[float]) -> None:
 def test_a_run_is_as_ever_until_then_and_moves_by_less_from_then_on(backbone: str, tmp_path: Path) -> None:
     """Of eight steps the last four are cooled, the first of these not yet: five are those of a run without."""
 
-    def run_of(cooldown: float, stop_after: int | None = None) -> Run:
+    def models_of(cooldown: float) -> list[dict[str, Tensor]]:
+        """After five steps and after all."""
         words = ("iterations=8", f"backbone={backbone}", "rasterizer=eager", f"training.cooldown={cooldown}")
-        return tiny_run(tmp_path / f"{cooldown}_{stop_after}", (*words, "training.test_points=0"), stop_after)
+        runs = [trained(tmp_path, steps, *words) for steps in (5, 8)]
+        return [{name: value.detach() for name, value in run.backbone.table.parameters.items()} for run in runs]
 
-    (five, whole), (five_cooled, cooled) = ([run_of(share, stop) for stop in (5, None)] for share in (0, 0.5))
-    for name, value in five.backbone.table.parameters.items():
-        assert torch.equal(value, five_cooled.backbone.table.parameters[name])
-        moved = (whole.backbone.table.parameters[name] - value).detach().norm()
-        less = (cooled.backbone.table.parameters[name] - value).detach().norm()
+    (five, whole), (five_cooled, cooled) = models_of(0), models_of(0.5)
+    for name, value in five.items():
+        assert torch.equal(value, five_cooled[name])
+        moved, less = (whole[name] - value).norm(), (cooled[name] - value).norm()
         if moved > 0:
             assert 0.2 < float(less / moved) < 0.8  # three quarters, a half, a quarter of three steps

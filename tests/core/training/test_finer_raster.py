@@ -10,7 +10,7 @@ import torch
 from module_contexts import build_module
 from raster_scenes import SMOOTH, changed, front_camera, gradients, leaves, soft_splats
 from small_scene import published_options, small_gs3d, small_scene, spread
-from tiny import tiny_run, tiny_settings
+from tiny import tiny_run, tiny_settings, trained
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
@@ -187,8 +187,8 @@ def test_pictures_go_on_as_they_were_where_renders_become_finer() -> None:
 
 def test_one_is_the_published_loop_bit_for_bit_and_two_is_another_run(tmp_path: Path) -> None:
     words = ("iterations=30", "rasterizer=eager", "backbone=mip_splatting")
-    runs = {k: tiny_run(tmp_path / str(k), [*words, f"training.supersampling.factor={k}"]) for k in (1, 2)}
-    plain = tiny_run(tmp_path / "plain", words)
+    runs = {k: trained(tmp_path, 30, *words, f"training.supersampling.factor={k}") for k in (1, 2)}
+    plain = trained(tmp_path, 30, *words)
     assert torch.equal(runs[1].backbone.table["means"], plain.backbone.table["means"])
     assert not torch.equal(runs[2].backbone.table["means"], plain.backbone.table["means"])
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from module_contexts import build_module, coarse_modules
 from small_scene import Grey, published_options, small_context, small_gs3d, small_scene, spread
-from tiny import final_tensors, tiny_run, tiny_settings
+from tiny import same_ending, tiny_run, tiny_settings, trained
 from torch import Tensor
 
 from gsx.backbones.adaptive import Adaptive, AdaptiveOptions
@@ -143,15 +143,12 @@ def test_a_run_sees_coarse_pictures_first_and_goes_on_bit_for_bit(tmp_path: Path
     tiny_run(tmp_path / "parts", adaptive, stop_after=7)
     parts, parts_settings = open_run(tmp_path / "parts", loaded, training=True)
     execute(parts, parts_settings, loaded)
-    for name, value in final_tensors(tmp_path / "whole").items():
-        assert torch.equal(final_tensors(tmp_path / "parts")[name], value), name
+    same_ending(tmp_path / "whole", tmp_path / "parts")
 
 
 def test_of_1_nothing_changes(tmp_path: Path) -> None:
-    plain = tiny_run(tmp_path / "plain", ["iterations=8"])
-    one = tiny_run(
-        tmp_path / "one", ["iterations=8", "training.coarse_to_fine.factor=1", "training.coarse_to_fine.until=0.5"]
-    )
+    factor = ("training.coarse_to_fine.factor=1", "training.coarse_to_fine.until=0.5")
+    plain, one = (trained(tmp_path, 8, "iterations=8", *more) for more in ((), factor))
     assert torch.equal(plain.backbone.table["means"], one.backbone.table["means"])
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from tiny import final_tensors, tiny_run, tiny_settings
+from tiny import final_tensors, same_ending, stopped_at, tiny_run, tiny_settings
 
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
@@ -22,12 +22,6 @@ from gsx.experiments.runs.evaluate import advice, remedies
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.open import open_run, start
 from gsx.formats.splat_files import read_gaussians
-
-
-def assert_same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
-    assert a.keys() == b.keys()
-    for name in a:
-        assert torch.equal(a[name], b[name]), name
 
 
 def resume(folder: Path, *overrides: str) -> None:
@@ -118,7 +112,7 @@ def test_a_plain_run_is_advised_where_a_pretrained_upscaler_is_installed(finishe
 
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(finished: Path, tmp_path: Path) -> None:
     tiny_run(tmp_path / "again", DENSE)
-    assert_same(final_tensors(finished), final_tensors(tmp_path / "again"))
+    same_ending(finished, tmp_path / "again")
     tiny_run(tmp_path / "other", (*DENSE, "seed=1"))
     other = final_tensors(tmp_path / "other")["parameters.means"]
     assert other.shape != final_tensors(finished)["parameters.means"].shape or not torch.equal(
@@ -126,25 +120,24 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(finished: P
     )
 
 
-@pytest.mark.parametrize("stop", [1, 5, 12, 13, 23])
-def test_resume_equals_never_having_stopped(finished: Path, tmp_path: Path, stop: int) -> None:
-    tiny_run(tmp_path / "run", DENSE, stop_after=stop)
-    assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "interrupted"
-    assert (tmp_path / "run" / "report.html").is_file()
-    resume(tmp_path / "run")
-    assert_same(final_tensors(finished), final_tensors(tmp_path / "run"))
-    steps = [json.loads(line)["step"] for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+def test_resume_equals_never_having_stopped(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    stopped_at(folder, DENSE, 1, 5, 12, 13, 23)
+    same_ending(finished, folder)
+    steps = [json.loads(line)["step"] for line in (folder / "metrics.jsonl").read_text().splitlines()]
     assert steps == sorted(set(steps))
 
 
 def test_a_killed_run_resumes_from_its_last_checkpoint(finished: Path, tmp_path: Path) -> None:
     # checkpoints at 7 and 14; the files a kill at step 16 would leave: later metrics, a stale temporary file
     tiny_run(tmp_path / "run", DENSE, stop_after=16)
+    assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "interrupted"
+    assert (tmp_path / "run" / "report.html").is_file()
     for path in (tmp_path / "run" / "checkpoints").glob("step_0000016.*"):
         path.unlink()
     (tmp_path / "run" / "checkpoints" / ".step_0000021.safetensors.1.partial").write_bytes(b"half")
     resume(tmp_path / "run")
-    assert_same(final_tensors(finished), final_tensors(tmp_path / "run"))
+    same_ending(finished, tmp_path / "run")
 
 
 def test_a_run_can_be_lengthened(tmp_path: Path) -> None:
@@ -158,12 +151,19 @@ def test_only_the_newest_checkpoints_are_kept(finished: Path) -> None:
     assert len(list((finished / "checkpoints").glob("*.json"))) == 2
 
 
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of 6 steps, stopped after the fifth, with checkpoints of the third and the fifth."""
+    folder = tmp_path_factory.mktemp("runs") / "stopped"
+    tiny_run(folder, ("iterations=6", "training.checkpoint_every=3"), stop_after=5)
+    return folder
+
+
 @pytest.mark.parametrize("damage", ["truncate", "flip", "gone", "no sidecar data", "head", "views", "order"])
 def test_a_damaged_checkpoint_is_named_and_the_one_before_used(
-    tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
+    stopped: Path, tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    folder = tmp_path / "run"
-    tiny_run(folder, ("iterations=6", "training.checkpoint_every=3"), stop_after=5)
+    folder = shutil.copytree(stopped, tmp_path / "run")
     newest = sorted((folder / "checkpoints").glob("*.safetensors"))[-1]
     data = newest.read_bytes()
     sidecar = newest.with_suffix(".json")
@@ -189,10 +189,9 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_used(
 
 @pytest.mark.parametrize("hindrance", ["schema", "permission"])
 def test_a_checkpoint_that_is_not_damaged_is_never_passed_over(
-    tmp_path: Path, hindrance: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    stopped: Path, tmp_path: Path, hindrance: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = tmp_path / "run"
-    tiny_run(folder, ("iterations=6", "training.checkpoint_every=3"), stop_after=5)
+    folder = shutil.copytree(stopped, tmp_path / "run")
     newest = sorted((folder / "checkpoints").glob("*.safetensors"))[-1]
     read_bytes = Path.read_bytes
 
@@ -216,8 +215,8 @@ def test_a_checkpoint_that_is_not_damaged_is_never_passed_over(
     assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == before
 
 
-def test_without_any_usable_checkpoint_the_error_says_so(tmp_path: Path) -> None:
-    tiny_run(tmp_path / "run", ("iterations=2",))
+def test_without_any_usable_checkpoint_the_error_says_so(stopped: Path, tmp_path: Path) -> None:
+    shutil.copytree(stopped, tmp_path / "run")
     for path in (tmp_path / "run" / "checkpoints").iterdir():
         path.unlink()
     with pytest.raises(CheckpointError, match="holds no checkpoint"):
@@ -265,11 +264,18 @@ def test_the_zooms_looked_at_do_not_change_the_protocol_hash(finished: Path, tmp
     assert json.loads((copy / "evaluation.json").read_text())["protocol"]["hash"] != before
 
 
-def test_a_checkpoint_that_is_written_while_an_older_one_is_read_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "run"
+@pytest.fixture(scope="module")
+def stopped_with_one(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same, of which one checkpoint is kept."""
+    folder = tmp_path_factory.mktemp("runs") / "stopped"
     tiny_run(folder, ("iterations=6", "training.checkpoint_every=3", "training.checkpoints_kept=1"), stop_after=5)
+    return folder
+
+
+def test_a_checkpoint_that_is_written_while_an_older_one_is_read_stays(
+    stopped_with_one: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = shutil.copytree(stopped_with_one, tmp_path / "run")
     read = checkpoint.read
 
     def slowly(sidecar: Path) -> Any:
@@ -283,9 +289,8 @@ def test_a_checkpoint_that_is_written_while_an_older_one_is_read_stays(
     assert (folder / "checkpoints" / "step_0000099.json").is_file()
 
 
-def test_a_newer_damaged_checkpoint_does_not_outlive_good_ones(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    tiny_run(folder, ("iterations=6", "training.checkpoint_every=3", "training.checkpoints_kept=1"), stop_after=5)
+def test_a_newer_damaged_checkpoint_does_not_outlive_good_ones(stopped_with_one: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(stopped_with_one, tmp_path / "run")
     newest = sorted((folder / "checkpoints").glob("*.safetensors"))[-1]
     shutil.copy(newest, newest.with_name("step_0000099.safetensors"))
     newest.with_name("step_0000099.json").write_text("{")

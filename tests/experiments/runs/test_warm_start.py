@@ -5,8 +5,7 @@ import os
 from pathlib import Path
 
 import pytest
-import torch
-from tiny import final_tensors, tiny_run
+from tiny import LIGHT, same_ending, tiny_run
 
 from gsx.builtin import plugins
 from gsx.core.training.run import Run
@@ -17,7 +16,7 @@ from gsx.experiments.runs.saved_settings import read_config
 from gsx.experiments.runs.warm_start import warm_start_folder, without_augmenters
 
 RUN = ("iterations=40", "regenerator/upscale=lanczos", "regenerator/restore=identity", "rasterizer=eager",
-       "training.checkpoint_every=100", "training.log_every=2", "backbone.density.gradient=1e-3")  # fmt: skip
+       "training.checkpoint_every=100", "training.log_every=2", "backbone.density.gradient=1e-3", *LIGHT)  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -33,12 +32,6 @@ def augmented(*names: str) -> tuple[str, ...]:
         f"augmenter=[{','.join(files.get(name, name) for name in names)}]",
         *(word for words in few for word in words),
     )
-
-
-def assert_same(a: Path, b: Path) -> None:
-    first, second = final_tensors(a), final_tensors(b)
-    assert first.keys() == second.keys()
-    assert all(torch.equal(first[name], second[name]) for name in first)
 
 
 def states_of(run: Run) -> Path:
@@ -60,7 +53,7 @@ def test_branches_equal_runs_from_scratch(tmp_path: Path, caplog: pytest.LogCapt
         tiny_run(tmp_path / name, (*RUN, *augmented(name), "init=warm_start"))
         assert f"branching at step {step} from an earlier run" in caplog.text
         tiny_run(tmp_path / f"{name}_scratch", (*RUN, *augmented(name)))
-        assert_same(tmp_path / name, tmp_path / f"{name}_scratch")
+        same_ending(tmp_path / name, tmp_path / f"{name}_scratch")
         assert [line["step"] for line in lines(tmp_path / name)] == [
             line["step"] for line in lines(tmp_path / f"{name}_scratch")
         ]
@@ -93,24 +86,19 @@ def test_nothing_is_taken_from_beyond_the_first_pseudo_views(tmp_path: Path) -> 
     ]
     tiny_run(tmp_path / "both", (*RUN, *augmented("upscale", "bootstrap"), "init=warm_start"))
     tiny_run(tmp_path / "scratch", (*RUN, *augmented("upscale", "bootstrap")))
-    assert_same(tmp_path / "both", tmp_path / "scratch")
+    same_ending(tmp_path / "both", tmp_path / "scratch")
 
 
-@pytest.mark.parametrize(
-    "other", ["seed=1", "backbone.density.gradient=1e-5", "iterations=41", "training.ssim_weight=0"]
-)
-def test_other_compositions_have_other_trunks(other: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_other_compositions_have_other_trunks(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """How a run is watched makes no other."""
     caplog.set_level("INFO")
     tiny_run(tmp_path / "first", (*RUN, "init=warm_start"), stop_after=12)
-    caplog.clear()
-    tiny_run(tmp_path / "second", (*RUN, other, "init=warm_start"), stop_after=1)
-    assert "no earlier run" in caplog.text
-
-
-def test_how_a_run_is_watched_makes_no_other_warm_start(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO")
-    tiny_run(tmp_path / "first", (*RUN, "init=warm_start"), stop_after=12)
-    tiny_run(tmp_path / "second", (*RUN, "training.log_every=5", "eval.zoom=[1,2]", "init=warm_start"), stop_after=14)
+    others = ("seed=1", "backbone.density.gradient=1e-5", "iterations=41", "training.ssim_weight=0")
+    for number, other in enumerate(others):
+        caplog.clear()
+        tiny_run(tmp_path / f"other{number}", (*RUN, other, "init=warm_start"), stop_after=1)
+        assert "no earlier run" in caplog.text
+    tiny_run(tmp_path / "same", (*RUN, "training.log_every=5", "eval.zoom=[1,2]", "init=warm_start"), stop_after=11)
     assert "branching at step 10" in caplog.text
 
 

@@ -149,7 +149,7 @@ def test_what_an_autoencoder_does_to_pictures_goes_through_every_variant(
             tried.append(chosen.options)
             augmenter = noisy(chosen.options, name, wide)
             wide.step = augmenter.event = augmenter.events[0]
-            _, facts = augmenter.made(wide, augmenter.event, {0, 1})
+            _, facts = augmenter.made(wide, augmenter.event, {0})
             assert sum(facts["asked"].values()) > 0
             assert facts["dropped"] == {}
     assert len(tried) > 10
