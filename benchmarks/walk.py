@@ -19,6 +19,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+import pycolmap
 import torch
 
 from gsx.api import show_messages
@@ -28,13 +29,18 @@ from gsx.core.data.images import write_image
 from gsx.core.data.scene import Scene
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene
+from gsx.scenes import sfm
+from gsx.scenes.readable import readable_size
 from measuring.machine import describe_machine, shown_command, told_load
 from measuring.results import read_sections, stamped, text_table, write_results
 
 RESULTS = Path(__file__).parent / "results"
 CAPTURES = ("office", "castle", "fox")
+BARE = 20
+"""Features below which a photo shows nothing to match: COLMAP verifies a pair by 15 matches."""
 COLUMNS = [
     *(["scene", "scene"], ["photos", "photos"], ["placed", "placed"], ["share", "share placed, %"]),
+    *(["bare", f"not placed: fewer than {BARE} features"], ["others", "not placed: others"]),
     *(["points", "points"], ["centre", "camera centre, median error, %"], ["worst", "largest, %"]),
     *(["turn", "direction, median error, degrees"], ["worst_turn", "largest, degrees"], ["seconds", "CPU s"]),
 ]
@@ -87,13 +93,27 @@ def placed_row(name: str, folder: Path, photos: int, truth: Cameras) -> dict[str
         seconds = time.process_time() - start
     row = {"scene": name, "photos": photos, "placed": len(scene.train), "share": 100 * len(scene.train) / photos}
     found = {view.name: view.camera for view in scene.train}
+    lost = sorted({file.name for file in folder.iterdir()} - found.keys())
+    bare = sum(count < BARE for count in feature_counts(folder, lost)) if lost else 0
+    row |= {"bare": bare, "others": len(lost) - bare}
     return row | {"points": len(scene.points), "seconds": round(seconds)} | pose_errors(found, truth)
+
+
+def feature_counts(folder: Path, names: Sequence[str]) -> list[int]:
+    """Numbers of features of some photos."""
+    options = compose(["scene=photos", f"scene.path={folder}"], plugins()).scene.options
+    sizes = {name: readable_size(folder / name) for name in names}
+    with tempfile.TemporaryDirectory() as work:
+        database = Path(work) / "database.db"
+        with sfm.quiet():
+            sfm.import_photos(database, folder, sizes, options)
+            sfm.extract(database, folder, sizes, options)
+        with pycolmap.Database.open(database) as reader:
+            return [reader.num_keypoints_for_image(image.image_id) for image in reader.read_all_images()]
 
 
 def pose_errors(found: Cameras, truth: Cameras) -> dict[str, float]:
     """Errors of camera centres, % of the extent of the true ones, and of directions, degrees; none without truth."""
-    import pycolmap
-
     names = sorted(found.keys() & truth.keys())
     if len(names) < 3:
         return {}

@@ -180,8 +180,12 @@ def test_attempts_end_where_nothing_is_left_to_try(monkeypatch: pytest.MonkeyPat
     assert partners == 9  # everyone else
 
 
-def test_mapping_continues_from_a_model(tmp_path: Path) -> None:
-    """One photo has no matches at first; with them it is placed among the others, which keep their numbers."""
+@pytest.mark.parametrize("points", [100, 20])
+def test_mapping_continues_from_a_model(tmp_path: Path, points: int) -> None:
+    """One photo has no matches at first; with them it is placed among the others, which keep their numbers.
+
+    COLMAP itself asks for 30 points.
+    """
     pycolmap.set_random_seed(0)
     settings = pycolmap.SyntheticDatasetOptions()
     settings.num_rigs, settings.num_frames_per_rig, settings.num_points3D = 1, 6, 100
@@ -199,6 +203,7 @@ def test_mapping_continues_from_a_model(tmp_path: Path) -> None:
         assert sfm.unplaced(before, sizes) == [truth.image(late).name]
         with pycolmap.Database.open(tmp_path / "database.db") as database:
             for other, geometry in held.items():
+                geometry.inlier_matches = geometry.inlier_matches[geometry.inlier_matches[:, 1] < points]
                 database.update_two_view_geometry(other, late, geometry)
         after = sfm.largest(sfm._map(*shared, tmp_path / "sparse1", 6, chosen, before))
     assert sfm.unplaced(after, sizes) == []
