@@ -69,6 +69,8 @@ def test_cost_of_a_step_by_a_measurement() -> None:
     scattered = step_cost(replace(measurement, random=True), options, "free")
     assert scattered.seconds(0, 0) == pytest.approx(0.042 / 4)
     assert scattered.seconds(1e6, 10_000) == pytest.approx(0.25 / 4)
+    crowded = step_cost(replace(measurement, random=True, primitives=100_000), options, "free")
+    assert (crowded.seconds(0, 0), crowded.seconds(0, 100_000)) == pytest.approx((0, 0.02)), "rows last"
 
 
 def test_events_of_density_control_take_steps() -> None:

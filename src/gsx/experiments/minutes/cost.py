@@ -110,12 +110,11 @@ class StepCost:
 def step_cost(measurement: Measurement, options: CostOptions, backbone: str) -> StepCost:
     """Returns the cost of a step by a measurement at the start and the relative costs of the options."""
     lasting = options.random if measurement.random else 1.0
-    unit, base = lasting * measurement.megapixel / MILLION, lasting * measurement.base
+    unit = lasting * measurement.megapixel / MILLION
     row = unit * options.primitives * options.rows.get(backbone, 1.0)
-    row = min(row, base / max(1, measurement.primitives))  # rows at the start cost no more than what was measured
-    base -= row * measurement.primitives
-    pixel = unit * options.late
-    return StepCost(base=base, pixel=pixel, row=row, event=options.event)
+    row = min(row, measurement.base / max(1, measurement.primitives))  # no more than what was measured
+    base = max(0.0, lasting * measurement.base - row * measurement.primitives)
+    return StepCost(base=base, pixel=unit * options.late, row=row, event=options.event)
 
 
 SHARES = 40
