@@ -88,7 +88,7 @@ def measured(scene: str, backbone: str, minutes: float, options: argparse.Namesp
 def figures(folder: Path) -> Row:
     """Returns the figures of a finished run."""
     evaluation, plan = read_json(folder / "evaluation.json"), plan_of(folder)
-    took, late = wall_seconds(folder), evaluation.get("late", [])
+    took, skipped = wall_seconds(folder), skipped_steps(folder)
     return {
         "took": took,
         "over": None if took is None else took / plan["limit_s"],
@@ -96,12 +96,18 @@ def figures(folder: Path) -> Row:
         "planned": plan["training_s"],
         "trained": evaluation["train_seconds"],
         "steps": plan["steps"],
-        "skipped": sum(round(last - first) + 1 for first, last in zip(late[::2], late[1::2], strict=True)),
+        "skipped": len(skipped),
         "downscale": plan["downscale"],
         "x1": evaluation["psnr"],
         "primitives": evaluation["primitives"],
         "commit": commit(),
     }
+
+
+def skipped_steps(folder: Path) -> set[int]:
+    """Returns the steps that a late run skipped."""
+    late = [round(step) for step in read_json(folder / "evaluation.json").get("late", [])]
+    return {step for first, last in zip(late[::2], late[1::2], strict=True) for step in range(first, last + 1)}
 
 
 def plan_of(folder: Path) -> dict[str, Any]:
@@ -119,8 +125,9 @@ def observations(folder: Path) -> Iterator[tuple[float, float, float, float]]:
     measurement, pixels = plan["measurement"], pixels_of(folder)
     lasting = plan_options().cost.of(measurement["device"]).random if measurement["random"] else 1.0
     lines = [line for line in read_lines(folder / "metrics.jsonl", {}) if "late_from" not in line]
+    skipped = skipped_steps(folder)
     for before, after in itertools.pairwise(lines):
-        steps = after["step"] - before["step"]
+        steps = len(set(range(before["step"] + 1, after["step"] + 1)) - skipped)
         if steps >= 5:
             scale = scale_at(config, after["step"])
             seconds = (after["seconds"] - before["seconds"]) / steps
