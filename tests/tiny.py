@@ -3,10 +3,12 @@
 import copy
 import json
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from safetensors.torch import load_file
@@ -83,14 +85,19 @@ def tiny_settings(folder: Path, *more: str) -> Settings:
     return replace(settings, scene=replace(chosen, component=replace(chosen.component, factory=load)))
 
 
-def tiny_run(folder: Path, more: Sequence[str] = (), stop_after: int | None = None) -> Run:
+def tiny_run(folder: Path, more: Sequence[str] = (), stop_after: int | None = None, evaluated: bool = True) -> Run:
     """Run the tiny experiment, interrupted after `stop_after` steps if given."""
     settings, loaded = tiny_settings(folder, *more), plugins()
     run = start(settings, loaded)
     listeners = [StopAfter(stop_after)] if stop_after is not None else []
-    with loaded.listening(listeners):
+    with loaded.listening(listeners), nullcontext() if evaluated else unevaluated():
         execute(run, settings, loaded, keep_states=True)
     return run
+
+
+def unevaluated() -> Any:
+    """Let runs end with their last checkpoint: evaluation and report take as long as a dozen steps."""
+    return patch("gsx.experiments.runs.execute.finish")
 
 
 def trained(folder: Path, steps: int, *more: str) -> Run:
@@ -103,12 +110,12 @@ def trained(folder: Path, steps: int, *more: str) -> Run:
 
 
 def stopped_at(folder: Path, more: Sequence[str], *stops: int) -> Run:
-    """The run stopped after these steps, opened again each time, and at last run to its end."""
+    """The run stopped after these steps, opened again each time, and at last trained to its end, unevaluated."""
     tiny_run(folder, more, stops[0])
     for stop in (*stops[1:], None):
         loaded = plugins()
         run, settings = open_run(folder, loaded, training=True)
-        with loaded.listening([] if stop is None else [StopAfter(stop)]):
+        with loaded.listening([] if stop is None else [StopAfter(stop)]), unevaluated():
             execute(run, settings, loaded)
         assert run.step == stop or (stop is None and run.complete)
     return run

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from small_scene import small_scene, spread
-from tiny import LIGHT, final_tensors, stopped_at, tiny_run
+from tiny import LIGHT, final_tensors, same_ending, stopped_at, tiny_run
 from torch import Tensor
 
 from gsx.backbones.anchor_grids import LevelGrids, automatic_voxel, voxel_nodes
@@ -560,13 +560,6 @@ def run_words(name: str) -> tuple[str, ...]:
     return (f"backbone={name}", *RUN, *MORE[name])
 
 
-def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
-    assert a.keys() == b.keys()
-    for name in a:
-        assert a[name].dtype == b[name].dtype, name
-        assert torch.equal(a[name], b[name]), name
-
-
 @pytest.fixture(scope="module", params=NAMES)
 def finished(request, tmp_path_factory) -> tuple[str, Path]:
     folder = tmp_path_factory.mktemp("runs") / request.param
@@ -602,4 +595,4 @@ def test_resume_equals_never_having_stopped(finished: tuple[str, Path], tmp_path
     """Stopped between two growths: with anchors that grew, moments, and statistics on the way."""
     name, folder = finished
     stopped_at(tmp_path / "run", run_words(name), 4)
-    assert_same(final_tensors(folder), final_tensors(tmp_path / "run"))
+    same_ending(folder, tmp_path / "run")

@@ -172,7 +172,7 @@ def test_without_need_training_is_bit_for_bit_that_without_a_sky(
 
 def test_a_run_with_a_sky_resumes_as_if_never_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = [*LIGHT_WITH_SKY, "backbone.sky=always", "iterations=18", "backbone.rates.shortened=0.4"]
-    whole = tiny_run(tmp_path / "whole", words)
+    whole = tiny_run(tmp_path / "whole", words, evaluated=False)
     tiny_run(tmp_path / "stopped", words, stop_after=5)
     with monkeypatch.context() as looking:
         looking.setattr(sky, "sky_of", lambda scene: pytest.fail("a checkpoint tells what is sky"))

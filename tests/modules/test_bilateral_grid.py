@@ -181,7 +181,7 @@ SHADED = (
 
 
 def test_a_run_with_grids_resumes_as_if_never_stopped(tmp_path: Path) -> None:
-    whole = tiny_run(tmp_path / "whole", SHADED)
+    whole = tiny_run(tmp_path / "whole", SHADED, evaluated=False)
     assert whole.modules["exposure"].grids is not None
     stopped_at(tmp_path / "stopped", SHADED, 9)
     a = same_ending(tmp_path / "whole", tmp_path / "stopped")

@@ -252,7 +252,7 @@ DISTURBED = (
 
 
 def test_a_run_with_exposures_resumes_as_if_never_stopped(tmp_path: Path) -> None:
-    whole = tiny_run(tmp_path / "whole", DISTURBED)
+    whole = tiny_run(tmp_path / "whole", DISTURBED, evaluated=False)
     assert whole.modules["exposure"].active
     stopped_at(tmp_path / "stopped", DISTURBED, 12)
     a = same_ending(tmp_path / "whole", tmp_path / "stopped")
@@ -268,9 +268,9 @@ def test_a_run_with_exposures_resumes_as_if_never_stopped(tmp_path: Path) -> Non
 
 
 def test_without_need_training_is_bit_for_bit_that_without_exposures(tmp_path: Path) -> None:
-    plain = tiny_run(tmp_path / "plain", ["iterations=12"])
+    plain = tiny_run(tmp_path / "plain", ["iterations=12"], evaluated=False)
     auto = ["iterations=12", "training.exposure.when=auto", "training.exposure.spread=1"]
-    tested = tiny_run(tmp_path / "tested", auto)
+    tested = tiny_run(tmp_path / "tested", auto, evaluated=False)
     assert not plain.modules["exposure"].active
     assert not tested.modules["exposure"].active
     same_ending(tmp_path / "plain", tmp_path / "tested")

@@ -138,7 +138,7 @@ def test_masked_windows_leave_no_step_out(monkeypatch: pytest.MonkeyPatch) -> No
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Path]:
     """(a finished run that left steps out, its folder)."""
     folder = tmp_path_factory.mktemp("whole") / "run"
-    return tiny_run(folder, LEAVES_OUT), folder
+    return tiny_run(folder, LEAVES_OUT, evaluated=False), folder
 
 
 def test_steps_that_gain_too_little_are_left_out(whole: tuple[Run, Path]) -> None:

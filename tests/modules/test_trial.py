@@ -156,15 +156,15 @@ def run_evaluation(folder: Path) -> dict:
 
 
 def test_a_run_with_a_trial_resumes_to_the_same_bits(tmp_path: Path) -> None:
-    tiny_run(tmp_path / "whole", WORDS)
+    tiny_run(tmp_path / "whole", WORDS, evaluated=False)
     stopped_at(tmp_path / "parts", WORDS, 11, 40)
     whole, parts = final_tensors(tmp_path / "whole"), final_tensors(tmp_path / "parts")
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
 
 
 def test_where_tests_call_for_nothing_a_run_has_the_bits_of_one_without(tmp_path: Path) -> None:
-    tiny_run(tmp_path / "auto", (*WORDS, "training.exposure.spread=1"))
-    tiny_run(tmp_path / "never", ("training.exposure.when=never", *WORDS[2:], WORDS[0]))
+    tiny_run(tmp_path / "auto", (*WORDS, "training.exposure.spread=1"), evaluated=False)
+    tiny_run(tmp_path / "never", ("training.exposure.when=never", *WORDS[2:], WORDS[0]), evaluated=False)
     auto, never = final_tensors(tmp_path / "auto"), final_tensors(tmp_path / "never")
     assert all(torch.equal(auto[name], never[name]) for name in never)
 

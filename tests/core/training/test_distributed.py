@@ -14,10 +14,8 @@ from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import load_file
 from small_scene import small_gs3d, small_scene, spread
-from tiny import OVERRIDES
-from torch import Tensor
+from tiny import OVERRIDES, final_tensors, same_ending
 
 from gsx.cli.dispatch import main
 from gsx.core.errors import ConfigError, Disagreement
@@ -118,17 +116,6 @@ def sentences(finished: subprocess.CompletedProcess) -> list[str]:
     return [line for line in lines if line.startswith("gsx: ")]
 
 
-def final(folder: Path) -> dict[str, Tensor]:
-    return load_file(sorted((folder / "checkpoints").glob("*.safetensors"))[-1])
-
-
-def assert_same(a: Path, b: Path) -> None:
-    first, second = final(a), final(b)
-    assert first.keys() == second.keys()
-    for name in first:
-        assert torch.equal(first[name], second[name]), name
-
-
 def lines(folder: Path) -> list[dict]:
     return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
@@ -147,7 +134,7 @@ def test_two_processes_equal_one_and_resume_as_one(forking: Any, tmp_path: Path)
     (folder,) = (tmp_path / "two" / "demo" / "gs3d").iterdir()
     alone(*OVERRIDES, *GS3D, f"folder={tmp_path / 'one'}")
     assert any("cloned" in line for line in lines(folder)), "the test needs density events"
-    assert_same(folder, tmp_path / "one")
+    same_ending(folder, tmp_path / "one")
     for mine, theirs in zip(lines(folder), lines(tmp_path / "one"), strict=True):
         same = mine.keys() - {"seconds", "memory_mb", "psnr"}
         assert {key: mine[key] for key in same} == {key: theirs[key] for key in same}
@@ -163,7 +150,7 @@ def test_two_processes_equal_one_and_resume_as_one(forking: Any, tmp_path: Path)
     again = both(forking, tmp_path / "said", "resume", str(tmp_path / "killed"))
     assert again.returncode == 0, again.stderr
     assert "at step 16" in again.stderr
-    assert_same(folder, tmp_path / "killed")
+    same_ending(folder, tmp_path / "killed")
     assert files(folder) == files(tmp_path / "killed")
 
 
@@ -183,7 +170,7 @@ def test_two_processes_judge_as_one(forking: Any, tmp_path: Path) -> None:
     alone(*words, f"folder={tmp_path / 'one'}")
     told = [line for line in lines(tmp_path / "one") if "judged" in line or "degree_0" in line]
     assert len(told) > 1, "the test needs something judged"
-    assert_same(tmp_path / "two", tmp_path / "one")
+    same_ending(tmp_path / "two", tmp_path / "one")
 
 
 def test_two_processes_relocate_as_one(forking: Any, tmp_path: Path) -> None:
@@ -194,7 +181,7 @@ def test_two_processes_relocate_as_one(forking: Any, tmp_path: Path) -> None:
     assert two.returncode == 0, two.stderr
     alone(*words, f"folder={tmp_path / 'one'}")
     assert any(line.get("relocated") for line in lines(tmp_path / "one")), "the test needs relocation"
-    assert_same(tmp_path / "two", tmp_path / "one")
+    same_ending(tmp_path / "two", tmp_path / "one")
 
 
 def test_two_processes_with_networks_and_pseudo_views_equal_one(forking: Any, tmp_path: Path) -> None:
@@ -202,7 +189,7 @@ def test_two_processes_with_networks_and_pseudo_views_equal_one(forking: Any, tm
     two = both(forking, tmp_path / "said", *OVERRIDES, *OCTREE, f"folder={tmp_path / 'two'}")
     assert two.returncode == 0, two.stderr
     alone(*OVERRIDES, *OCTREE, f"folder={tmp_path / 'one'}")
-    assert_same(tmp_path / "two", tmp_path / "one")
+    same_ending(tmp_path / "two", tmp_path / "one")
     assert any(line.get("grown") for line in lines(tmp_path / "two")), "the test needs growth"
     terms = [line["terms"] for line in lines(tmp_path / "two") if "terms" in line]
     assert terms == [line["terms"] for line in lines(tmp_path / "one") if "terms" in line]
@@ -219,7 +206,7 @@ def test_the_error_of_one_process_ends_both_with_one_sentence(forking: Any, tmp_
     assert failed.returncode != 0
     assert sentences(failed) == ["gsx: process 1 of 2 has stopped: a photograph cannot be read: mend it"]
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "failed"
-    assert final(tmp_path / "run")  # of step 4, the last one taken
+    assert final_tensors(tmp_path / "run")  # of step 4, the last one taken
     assert json.loads((tmp_path / "run" / "checkpoints" / "step_0000004.json").read_text())["step"] == 4
 
 
@@ -245,7 +232,7 @@ def test_a_stop_asked_of_one_process_stops_both_after_the_same_step(tmp_path: Pa
     again = together("resume", str(tmp_path / "run"))
     assert again.returncode == 0, again.stderr
     alone(*words, f"folder={tmp_path / 'one'}")
-    assert_same(tmp_path / "run", tmp_path / "one")
+    same_ending(tmp_path / "run", tmp_path / "one")
 
 
 @pytest.mark.slow
@@ -269,7 +256,7 @@ def test_a_branch_from_a_trunk_equals_one_from_scratch(tmp_path: Path) -> None:
         done = together(*words, f"folder={tmp_path / name}", **environment)
         assert done.returncode == 0, done.stderr
     assert "branching at step" in done.stderr
-    assert_same(tmp_path / "first", tmp_path / "second")
+    same_ending(tmp_path / "first", tmp_path / "second")
 
 
 @pytest.mark.slow

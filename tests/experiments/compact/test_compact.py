@@ -75,7 +75,9 @@ def generator() -> torch.Generator:
 
 @pytest.fixture(scope="module")
 def prepared(folder: Path) -> Search:
-    return Search(opened(folder), ShrinkOptions(max_drop=0.0, steps=0, zooms=(1.0,)), plugins(), generator())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importance, "DRAWS", 6)
+        return Search(opened(folder), ShrinkOptions(max_drop=0.0, steps=0, zooms=(1.0,)), plugins(), generator())
 
 
 @pytest.fixture
@@ -215,6 +217,7 @@ def test_a_budget_that_nothing_meets_leaves_the_model_as_it_was(search: Search) 
     assert search.trained(best) is search.run
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_a_candidate_knows_nothing_of_the_others_exposures(folder: Path) -> None:
     run = opened(folder)
     run.modules["exposure"].start(torch.eye(3, 4).repeat(len(run.train_views), 1, 1))

@@ -22,6 +22,7 @@ RUN = ("iterations=40", "regenerator/upscale=lanczos", "regenerator/restore=iden
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSX_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("gsx.experiments.runs.execute.finish", lambda *_: None)  # no figures are needed
 
 
 def augmented(*names: str) -> tuple[str, ...]:
