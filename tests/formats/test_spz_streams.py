@@ -13,7 +13,7 @@ import torch
 import zstandard
 from test_compact_files import many, the_splat
 
-from gsx.backbones.merging import covariances
+from gsx.backbones.long_axis import covariances
 from gsx.core.errors import InputError
 from gsx.core.gaussians.sh import harmonics
 from gsx.formats import zstd

@@ -1,18 +1,19 @@
 """Splits along the longest axis: two adjacent halves replace one Gaussian (Improved-GS)."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gsx.backbones.capacity import frozen_table
 from gsx.backbones.density import mean_absolute, within_room
 from gsx.backbones.density_control import DensityControl, replace_rows
 from gsx.backbones.gs3d_options import GS3DOptions
-from gsx.backbones.merging import covariances, principal_axes
 from gsx.backbones.sky import not_sky
-from gsx.core.gaussians.quaternions import rotation_matrices
+from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.backbone import Backbone, BackboneContext
 from gsx.core.training.importance import Probe, random_views
@@ -23,6 +24,19 @@ STEP, LENGTH, OPACITY = 1.35, 0.55, 0.6
 ACROSS = math.sqrt(1 - 0.45**2)
 """Scale of a half along the other axes over the whole's."""
 LARGEST_OPACITY = 1 - 1e-6
+
+
+def covariances(rows: Mapping[str, Tensor]) -> Float[Tensor, "N 3 3"]:
+    """Returns covariances of Gaussians by raw parameters, world units squared."""
+    spread = rotation_matrices(rows["quats"]) * rows["log_scales"].exp()[:, None]
+    return spread @ spread.mT
+
+
+def principal_axes(covariance: Float[Tensor, "N 3 3"]) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
+    """Returns (variances along the axes, ascending; unit quaternions of the axes)."""
+    variances, axes = torch.linalg.eigh(covariance)
+    axes = axes * torch.linalg.det(axes).sign()[:, None, None]
+    return variances, normalize(quaternions_of(axes), dim=1)
 
 
 def halves(rows: dict[str, Tensor]) -> list[dict[str, Tensor]]:

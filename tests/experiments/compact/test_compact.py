@@ -30,8 +30,7 @@ from gsx.experiments.compact import shrink
 from gsx.experiments.compact.compact import compact
 from gsx.experiments.compact.fine_tuning import copied_model, fine_tuned, split_views
 from gsx.experiments.compact.quality import above_rounding, zoomed_psnr
-from gsx.experiments.compact.reduction import Reduction
-from gsx.experiments.compact.shrink import Candidate, Search, ShrinkOptions, closer_window, importance_of
+from gsx.experiments.compact.shrink import Candidate, Search, ShrinkOptions, closer_window, importance_of, important
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.load_scene import load_scene
@@ -108,7 +107,7 @@ def test_what_cannot_be_seen_is_worth_least(folder: Path, monkeypatch: pytest.Mo
     worth = importance_of(run, run.scene.train, generator())
     assert float(worth[faint].max()) < 1e-9 * float(worth.max())
     pictures = [render(run, view.camera).image for view in run.scene.train]
-    Reduction(run.backbone.table, worth, None).apply(run.backbone.table, 0.5)
+    keep_rows(run.backbone.table, important(worth, 0.5))
     assert len(run.backbone.table) == len(faint) // 2
     for picture, view in zip(pictures, run.scene.train, strict=True):
         assert psnr(render(run, view.camera).image, picture) > 60
@@ -225,7 +224,7 @@ def test_a_candidate_knows_nothing_of_the_others_exposures(folder: Path) -> None
     drops = []
     for share in (0.25, 0.5, 0.25):
         search.candidates.clear()  # or the third would be the first
-        drops.append(search.evaluate(share, search.untouched.degree, False).drop)
+        drops.append(search.evaluate(share, search.untouched.degree).drop)
     assert drops[0] == drops[2]
     assert torch.equal(
         run.modules["exposure"].state_dict()["matrices"], torch.eye(3, 4).repeat(len(run.train_views), 1, 1)
@@ -236,11 +235,11 @@ def with_drops(search: Search, drops: dict[int, float], monkeypatch: pytest.Monk
     """Candidates lose half a dB of the share of their rows, and `drops` by degree; nothing is learnt."""
     rows = len(search.importance)
 
-    def evaluate(share: float, degree: int, merging: bool) -> Candidate:
+    def evaluate(share: float, degree: int) -> Candidate:
         left = round((1 - share) * rows)
         size = left * search.untouched.megabytes / rows * (14 + 3 * (degree + 1) ** 2 - 3) / (14 + 3 * 9 - 3)
-        drop = 0.5 * share + drops[degree] + (0.01 if merging else 0.0)
-        made = replace(search.untouched, removed=share, degree=degree, merging=merging, megabytes=size, drop=drop)
+        drop = 0.5 * share + drops[degree]
+        made = replace(search.untouched, removed=share, degree=degree, megabytes=size, drop=drop)
         search.candidates.append(made)
         return made
 
@@ -263,9 +262,8 @@ def test_the_smallest_within_the_budget_is_found(
     search.options, search.reserve = replace(search.options, max_drop=0.3 + reserve, tries=5), reserve
     with_drops(search, drops, monkeypatch)
     best = search.smallest()
-    assert [made.removed for made in search.candidates[2:7]] == [0.5, 0.75, 0.625, 0.5625, 0.59375]
-    assert [made.merging for made in search.candidates[:3]] == [True, False, False]
-    assert (best.degree, best.merging) == (degree, False)
+    assert [made.removed for made in search.candidates[:5]] == [0.5, 0.75, 0.625, 0.5625, 0.59375]
+    assert best.degree == degree
     assert most - 1 / 32 < best.removed <= most
     assert all(best.megabytes <= made.megabytes or made.drop > 0.3 for made in search.candidates)
 

@@ -141,13 +141,11 @@ def appending(new: Tensor) -> Callable[[Tensor], Tensor]:
     return lambda old: torch.cat([old, new])
 
 
-def append_rows(table: ParameterTable, rows: dict[str, Tensor], squares: Mapping[str, Tensor] | None = None) -> None:
-    """Appends rows to all parameters and columns, with zero statistics and moments; `squares`: second moments."""
+def append_rows(table: ParameterTable, rows: dict[str, Tensor]) -> None:
+    """Appends rows to all parameters and columns, with zero statistics and moments."""
     count = len(next(iter(rows.values())))
     for name in table.parameters:
         edit(table, name, appending(rows[name]), appending(torch.zeros_like(rows[name])))
-    for name, moments in (squares or {}).items():
-        table.optimiser.state[table.parameters[name]]["exp_avg_sq"][-count:] = moments
     for name, column in table.columns.items():
         table.columns[name] = torch.cat([column, rows[name]])
     for name, sums in table.statistics.items():
@@ -170,12 +168,6 @@ def reset_column(table: ParameterTable, name: str, values: Tensor) -> None:
 def detached_rows(table: ParameterTable) -> dict[str, Tensor]:
     """Returns all parameters and columns by name, detached."""
     return {name: parameter.detach() for name, parameter in table.parameters.items()} | table.columns
-
-
-def second_moments(table: ParameterTable) -> dict[str, Tensor]:
-    """Returns Adam's second moments by parameter name, of parameters with Adam state."""
-    states = {name: table.optimiser.state.get(parameter) for name, parameter in table.parameters.items()}
-    return {name: state["exp_avg_sq"] for name, state in states.items() if state}
 
 
 # -- steps -------------------------------------------------------------------------------------------------------------

@@ -19,15 +19,13 @@ from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.errors import TrainingError, first_line
-from gsx.core.gaussians.sh import colour_of_constant
 from gsx.core.plugins import Plugins
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.importance import Probe, draws_per_view
-from gsx.core.training.parameter_table import size_of
+from gsx.core.training.parameter_table import keep_rows, size_of
 from gsx.core.training.run import Run
 from gsx.experiments.compact.fine_tuning import BANDS, copied_model, degree_of_run, fine_tuned, split_views
 from gsx.experiments.compact.quality import least_file_loss, zoomed_psnr
-from gsx.experiments.compact.reduction import Reduction
 
 logger = logging.getLogger(__name__)
 
@@ -59,8 +57,6 @@ class Candidate:
     """Share of the rows that went."""
     degree: int
     """Highest degree of colour; -1: the model has no bands of its own."""
-    merging: bool
-    """True if rows were merged with neighbours."""
     primitives: int
     megabytes: float
     psnr: dict[str, float]
@@ -116,12 +112,11 @@ def colours_of_lower_degrees(
     return [fitted(fits, degree) for degree in range(highest)]
 
 
-def mean_colours(run: Run, lower: Sequence[Float[Tensor, "n 3 N"]]) -> Float[Tensor, "N 3"] | None:
-    """Returns colours of rows, in the mean over the views that show them; None: rows have no colours."""
-    constant = run.backbone.table.parameters.get("sh_dc")
-    if constant is None:
-        return None
-    return colour_of_constant(constant.detach()[:, 0] + (lower[0][0].T if lower else 0.0))
+def important(importance: Float[Tensor, "N"], share: float) -> Bool[Tensor, "N"]:
+    """Marks the rows that stay if a share of them goes, the least important first; at least one stays."""
+    count, kept = len(importance), torch.ones_like(importance, dtype=torch.bool)
+    kept[importance.double().argsort(stable=True)[: min(count - 1, round(share * count))]] = False
+    return kept
 
 
 class Search:
@@ -133,11 +128,6 @@ class Search:
         self.before = zoomed_psnr(run, self.validation, options.zooms)
         self.importance = importance_of(run, run.train_views, generator)
         self.colours = colours_of_lower_degrees(run, run.train_views, generator)
-        means = mean_colours(run, self.colours)
-        self.reductions = {
-            merging: Reduction(run.backbone.table, self.importance, means if merging else None)
-            for merging in (True, False)
-        }
         whole = self.fine_tuned(run, degree_of_run(run))
         self.reference = zoomed_psnr(whole, self.validation, options.zooms)
         lost = least_file_loss(whole, self.validation, self.reference)
@@ -148,7 +138,6 @@ class Search:
         self.untouched = Candidate(
             removed=0.0,
             degree=degree_of_run(run),
-            merging=False,
             primitives=rows,
             megabytes=size / 1e6,
             psnr=self.before,
@@ -159,21 +148,21 @@ class Search:
         """Trains a smaller model on the views that it is not evaluated on."""
         return fine_tuned(run, self.training, degree, self.options.steps, self.plugins)
 
-    def reduced(self, share: float, degree: int, merging: bool) -> Run:
-        """Returns the run with a share of its rows less, merged or not, and colours of a degree."""
+    def reduced(self, share: float, degree: int) -> Run:
+        """Returns the run with a share of its rows less, and colours of a degree."""
         model = copied_model(self.run)
         if 0 <= degree < len(self.colours):
             every = torch.ones_like(self.importance, dtype=torch.bool)
             take_coefficients(model.table, every, self.colours[degree])
-        self.reductions[merging].apply(model.table, share)
+        keep_rows(model.table, important(self.importance, share))
         return replace(self.run, backbone=model)
 
-    def evaluate(self, share: float, degree: int, merging: bool) -> Candidate:
+    def evaluate(self, share: float, degree: int) -> Candidate:
         """Evaluates a candidate, once; one that cannot be trained has an infinite drop."""
         for known in self.candidates:
-            if (known.removed, known.degree, known.merging) == (share, degree, merging):
+            if (known.removed, known.degree) == (share, degree):
                 return known
-        smaller = self.reduced(share, degree, merging)
+        smaller = self.reduced(share, degree)
         try:
             psnr = zoomed_psnr(self.fine_tuned(smaller, degree), self.validation, self.options.zooms)
         except TrainingError as error:
@@ -183,7 +172,6 @@ class Search:
         candidate = Candidate(
             removed=share,
             degree=degree,
-            merging=merging,
             primitives=rows,
             megabytes=size_with(smaller, degree, size) / 1e6,
             psnr=psnr,
@@ -197,9 +185,9 @@ class Search:
         """Logs a candidate and whether it is within the budget."""
         psnr = ", ".join(f"x{zoom} {value:.2f}" for zoom, value in candidate.psnr.items())
         logger.info(
-            "%d primitives (%.0f %% less%s), degree %d: %s dB, drop %.3f %s %.3g dB",
-            *(candidate.primitives, 100 * candidate.removed, ", merged" if candidate.merging else ""),
-            *(candidate.degree, psnr, candidate.drop, "<=" if self.allowed(candidate) else ">"),
+            "%d primitives (%.0f %% less), degree %d: %s dB, drop %.3f %s %.3g dB",
+            *(candidate.primitives, 100 * candidate.removed, candidate.degree, psnr),
+            *(candidate.drop, "<=" if self.allowed(candidate) else ">"),
             self.options.max_drop - self.reserve,
         )
 
@@ -209,59 +197,44 @@ class Search:
 
     def smallest(self) -> Candidate:
         """Searches the smallest model within the budget; the untouched one if there is none."""
-        degree, merging = degree_of_run(self.run), self.merging_loses_less()
-        best = self.fewest_rows(degree, 0.0, 1.0, merging) or self.untouched
+        degree = degree_of_run(self.run)
+        best = self.fewest_rows(degree, 0.0, 1.0) or self.untouched
         for lower in range(degree - 1, -1, -1):
-            smaller = self.smaller(best, lower, merging)
+            smaller = self.smaller(best, lower)
             if smaller is None:
                 break
             best = smaller
         return best
 
-    def smaller(self, best: Candidate, degree: int, merging: bool) -> Candidate | None:
+    def smaller(self, best: Candidate, degree: int) -> Candidate | None:
         """Searches a candidate of a lower degree that is within the budget and smaller than another."""
-        candidate = self.evaluate(best.removed, degree, merging)
+        candidate = self.evaluate(best.removed, degree)
         if self.allowed(candidate):
             return candidate
-        least = self.share_as_small(best, degree)
-        if not self.allowed(self.evaluate(least, degree, merging)):  # with fewer rows still less
+        rows, size = size_of(self.run.backbone.table)  # least: with it a model of that degree is as small
+        least = max(0.0, 1 - best.megabytes / (size_with(self.run, degree, size) / 1e6 / rows * rows))
+        if not self.allowed(self.evaluate(least, degree)):  # with fewer rows still less
             return None
-        return self.fewest_rows(degree, least, best.removed, merging)
+        return self.fewest_rows(degree, least, best.removed)
 
-    def merging_loses_less(self) -> bool:
-        """Returns whether less is lost where half of the rows are merged than where they are removed.
-
-        Merged rows draw what both drew, but learn less from there on: that pays where a model has no rows to spare.
-        """
-        if not self.reductions[True].rows:
-            return False
-        merged, removed = (self.evaluate(0.5, degree_of_run(self.run), merging) for merging in (True, False))
-        return merged.drop < removed.drop
-
-    def fewest_rows(self, degree: int, least: float, most: float, merging: bool) -> Candidate | None:
+    def fewest_rows(self, degree: int, least: float, most: float) -> Candidate | None:
         """Bisects the share of rows that goes between two; returns the best within the budget, None: there is none."""
         best = None
         while most - least > 2**-self.options.tries:
             share = (least + most) / 2
-            candidate = self.evaluate(share, degree, merging)
+            candidate = self.evaluate(share, degree)
             if self.allowed(candidate):
                 best, least = candidate, share
             else:
                 most = share
         return best
 
-    def share_as_small(self, best: Candidate, degree: int) -> float:
-        """Returns the share of rows without which a model of a degree is as small as another."""
-        rows, size = size_of(self.run.backbone.table)
-        of_row = size_with(self.run, degree, size) / 1e6 / rows
-        return max(0.0, 1 - best.megabytes / (of_row * rows))
-
     def trained(self, candidate: Candidate) -> Run:
         """Returns the run with a candidate's model, fine-tuned on all training views."""
         run = self.run
         if candidate not in self.candidates:
             return run
-        smaller = self.reduced(candidate.removed, candidate.degree, candidate.merging)
+        smaller = self.reduced(candidate.removed, candidate.degree)
         return fine_tuned(smaller, run.train_views, candidate.degree, self.options.steps, self.plugins)
 
 
