@@ -19,8 +19,7 @@ from typing import Any
 import torch
 
 from gsx.core.files import read_json
-from gsx.experiments.minutes.cost import MILLION
-from gsx.experiments.minutes.options import plan_options
+from gsx.experiments.minutes.cost import MILLION, plan_options
 from gsx.experiments.run_folder.files import read_lines
 from measuring.machine import commit, describe_machine, shown_command, told_load
 from measuring.results import Section, read_sections, stamped, text_table, write_results

@@ -10,8 +10,7 @@ from typing import Any
 from gsx import __version__
 from gsx.cli import arguments as parsers
 from gsx.cli.exit_codes import discard_unwritten, report_closed_output, report_error
-from gsx.cli.judge_arguments import parse_methods
-from gsx.cli.prepare_arguments import parse_prepare
+from gsx.cli.program_arguments import parse_methods, parse_prepare
 from gsx.core.errors import ConfigError, nearest
 from gsx.core.files import expand_home
 from gsx.engine.collector import loading
@@ -95,7 +94,8 @@ def dispatch_together(arguments: list[str]) -> int:
 def dispatch(arguments: list[str]) -> int:
     """Run the command that the words name."""
     first = arguments[0] if arguments else ""
-    if first == "help" or ({"--help", "-h"} & set(arguments) and first not in VERBS and not is_unknown(first)):
+    known = not first or first.startswith("-") or is_override(first) or expand_home(first).exists()
+    if first == "help" or ({"--help", "-h"} & set(arguments) and first not in VERBS and known):
         sys.stdout.write(HELP)
         return 0
     if arguments == ["--version"]:
@@ -109,11 +109,6 @@ def dispatch(arguments: list[str]) -> int:
     if expand_home(first).exists():
         return TRAIN_FOLDER(arguments)
     raise ConfigError(unknown_command(first))
-
-
-def is_unknown(word: str) -> bool:
-    """Return True for a word that names neither a setting, an option nor a path."""
-    return bool(word) and not word.startswith("-") and not is_override(word) and not expand_home(word).exists()
 
 
 def unknown_command(word: str) -> str:
@@ -141,7 +136,7 @@ TRAIN_FOLDER = command(parsers.parse_folder, "train", "train_folder")
 VERBS = {
     "resume": command(parsers.parse_resume, "train", "resume"),
     "eval": command(parsers.parse_eval, "runs", "evaluate"),
-    "judge": command(parse_methods, "judge", "compare"),
+    "judge": command(parse_methods, "programs", "compare"),
     "photographs": command(parsers.parse_photographs, "runs", "check_photographs"),
     "render": command(parsers.parse_render, "runs", "render"),
     "view": command(parsers.parse_view, "runs", "view"),
@@ -150,7 +145,7 @@ VERBS = {
     "merge": command(parsers.parse_merge, "runs", "merge_runs"),
     "report": command(parsers.parse_report, "facts", "report"),
     "scenes": command(parsers.parse_scenes, "facts", "check_scene"),
-    "prepare": command(parse_prepare, "prepare", "prepare_scene"),
+    "prepare": command(parse_prepare, "programs", "prepare_scene"),
     "datasets": command(parsers.parse_datasets, "facts", "datasets"),
     "explain": command(parsers.parse_explain, "facts", "explain_key"),
     "plugins": command(parsers.parse_plugins, "facts", "list_plugins"),

@@ -41,7 +41,7 @@ from gsx.experiments.runs.multirun import check_overrides, job_overrides, job_pl
 from gsx.experiments.runs.open import open_run, refuse_other, stamped_folder
 from gsx.experiments.runs.overrides import quoted, with_quoted_paths, word_of
 from gsx.experiments.runs.saved_settings import write_config
-from gsx.experiments.runs.settings import Settings, settings_from
+from gsx.experiments.runs.settings import settings_from
 from gsx.experiments.runs.video import is_video, photos_of
 from gsx.experiments.tables.sweep import is_table, run_table, with_plus
 
@@ -57,8 +57,9 @@ def train(words: list[str], of_folder: bool = False) -> int:
     of_folder: the command names a folder or a video, whose run on a CPU has a default length, as that of photos.
     """
     because = untimed_because(words) if of_folder or of_photos(words) else ""
-    words = with_plus(without_length(with_default_time(words) if trains_photos(words) else words))
-    if MULTIRUN & set(words):
+    several = bool(MULTIRUN & set(words))
+    words = with_plus(without_length(with_default_time(words) if of_photos(words) and not several else words))
+    if several:
         return train_several(words, because)
     if any(word.startswith("-") for word in words):
         return print_by_hydra(words)
@@ -69,7 +70,9 @@ def train(words: list[str], of_folder: bool = False) -> int:
         settings = planned(compose(words, loaded := plugins()), words, loaded, process_start())
         log_untimed(because, f"{settings.general.iterations:,} steps")
         code = job.train(settings, loaded, folders)
-    log_time(settings, code, time.monotonic() - process_start())
+    if settings.time_plan and code == 0:
+        seconds, limit = time.monotonic() - process_start(), settings.time_plan["limit_s"]
+        logger.info("took %.1f of %.1f minutes (%+.0f %%)", seconds / 60, limit / 60, 100 * (seconds / limit - 1))
     return print_report(code, folders[0])
 
 
@@ -77,18 +80,6 @@ def of_photos(words: Sequence[str]) -> bool:
     """Return True for words that train on photos, one run or several."""
     flags = {word for word in words if word.startswith("-")}
     return "scene=photos" in words and flags <= MULTIRUN and not is_table(words)
-
-
-def trains_photos(words: Sequence[str]) -> bool:
-    """Return True for words that train one run on photos."""
-    return of_photos(words) and not MULTIRUN & set(words)
-
-
-def log_time(settings: Settings, code: int, seconds: float) -> None:
-    """Log how long a planned run took, if it has ended."""
-    if settings.time_plan and code == 0:
-        limit = settings.time_plan["limit_s"]
-        logger.info("took %.1f of %.1f minutes (%+.0f %%)", seconds / 60, limit / 60, 100 * (seconds / limit - 1))
 
 
 def print_report(code: int, *folders: Path) -> int:

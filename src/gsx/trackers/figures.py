@@ -48,17 +48,18 @@ def zoom_figures(result: dict[str, Any]) -> dict[str, float]:
 
 
 def zoom_table(evaluation: dict[str, Any]) -> list[dict[str, str]]:
-    """Returns the figures of each zoom as texts by name, the same names in each row."""
-    rows = [zoom_row(factor, zoom_figures(result)) for factor, result in evaluation.get("zoom", {}).items()]
+    """Returns the figures of each zoom as texts by name, the same names in each row.
+
+    `gain` is the PSNR over that of the enlarged x1 render, dB.
+    """
+    rows = []
+    for factor, result in evaluation.get("zoom", {}).items():
+        figures = zoom_figures(result)
+        if factor != "1" and "enlarged_psnr" in figures:
+            figures = {"gain": figures["psnr"] - figures["enlarged_psnr"]} | figures
+        rows.append({"zoom": f"x{factor}"} | {name: f"{value:.4g}" for name, value in figures.items()})
     names = dict.fromkeys(name for row in rows for name in row)
     return [{name: row.get(name, "") for name in names} for row in rows]
-
-
-def zoom_row(factor: str, figures: dict[str, float]) -> dict[str, str]:
-    """Formats the figures of a zoom; `gain` is the PSNR over that of the enlarged x1 render, dB."""
-    compared = factor != "1" and "enlarged_psnr" in figures
-    gain = {"gain": figures["psnr"] - figures["enlarged_psnr"]} if compared else {}
-    return {"zoom": f"x{factor}"} | {name: f"{value:.4g}" for name, value in (gain | figures).items()}
 
 
 def markdown(table: list[dict[str, str]]) -> str:

@@ -104,17 +104,14 @@ class MLflow:
         uri = self.options.uri or state.get("uri") or default_store(run)
         self.client = self.client or client_of(uri)
         if state.get("uri") == uri:
-            self.resume(state["run"])
+            self.run_id = state["run"]
+            self.client.update_run(self.run_id, status="RUNNING")
+            points = self.client.get_metric_history(self.run_id, "loss")
+            self.sent_step = max((point.step for point in points), default=0)  # MLflow keeps duplicates
         else:
             self.create(run, uri)
         self.send(run)
         logger.info("tracker mlflow: run %s at %s", self.run_id, uri)
-
-    def resume(self, run_id: str) -> None:
-        """Continues after the last step in MLflow, which keeps duplicates."""
-        self.run_id = run_id
-        self.client.update_run(run_id, status="RUNNING")
-        self.sent_step = max((point.step for point in self.client.get_metric_history(run_id, "loss")), default=0)
 
     def create(self, run: Run, uri: str) -> None:
         """Creates MLflow's run with its parameters."""

@@ -19,7 +19,6 @@ from gsx.core.gaussians.splats import Gaussians
 from gsx.core.packages import require
 from gsx.core.plugins import hookimpl
 from gsx.core.ranges import Range
-from gsx.core.shapes import Float
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.trackers.figures import (
@@ -209,19 +208,15 @@ def splats(gaussians: Gaussians, harmonics: bool) -> Any:
     """Converts Gaussians to Rerun's: standard deviations, quaternions (x, y, z, w), colours with opacity in 8 bits."""
     import rerun
 
+    missing = gaussians.means.new_zeros(len(gaussians.means), BANDS - gaussians.sh_rest.shape[1], 3)
     colours = torch.cat([colour_of_constant(gaussians.sh_dc), gaussians.opacity_logits.sigmoid()[:, None]], 1)
     return rerun.GaussianSplats3D(
         numbers(gaussians.means),
         scales=numbers(gaussians.log_scales.exp()),
         quaternions=numbers(gaussians.quats.roll(-1, dims=1)),
         colors=numbers(to_uint8(colours)),
-        sh_coefficients=numbers(padded(gaussians.sh_rest)) if harmonics else None,
+        sh_coefficients=numbers(torch.cat([gaussians.sh_rest, missing], 1)) if harmonics else None,
     )
-
-
-def padded(rest: Float[Tensor, "N B 3"]) -> Float[Tensor, "N K 3"]:
-    """Appends zeros for the bands that are missing."""
-    return torch.cat([rest, rest.new_zeros(len(rest), BANDS - rest.shape[1], 3)], 1)
 
 
 def numbers(tensor: Tensor) -> Any:

@@ -21,7 +21,6 @@ from gsx.core.training.parameter_table import (
     named_parameters,
     reset_column,
     restore_table,
-    second_moments,
     shared_colour,
     size_of,
     table_tensors,
@@ -382,16 +381,6 @@ def test_steps_are_shorter_by_the_pace_and_rates_stay() -> None:
     for name, value in moved[1.0].items():
         torch.testing.assert_close(moved[0.25][name], 0.25 * value)
     torch.testing.assert_close(moved[1.0]["flat"], torch.ones(2))
-
-
-def test_rows_may_begin_with_second_moments() -> None:
-    table = ParameterTable({"flat": Parameter(torch.ones(2, 3)), "still": Parameter(torch.ones(2))})
-    table["flat"].sum().backward()
-    take_adam_step(table)
-    assert list(second_moments(table)) == ["flat"]
-    append_rows(table, {"flat": torch.zeros(1, 3), "still": torch.zeros(1)}, {"flat": torch.full((1, 3), 7.0)})
-    assert second_moments(table)["flat"][2].tolist() == [7, 7, 7]
-    assert not table.optimiser.state[table.parameters["flat"]]["exp_avg"][2].any()
 
 
 def test_shared_colour_is_that_of_the_colour_network_alone() -> None:

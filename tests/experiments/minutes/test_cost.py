@@ -6,6 +6,7 @@ import pytest
 
 from gsx.experiments.minutes.cost import (
     SHARES,
+    CostOptions,
     Growth,
     Measurement,
     Stage,
@@ -14,7 +15,6 @@ from gsx.experiments.minutes.cost import (
     stages_of,
     step_cost,
 )
-from gsx.experiments.minutes.options import CostOptions
 
 CONSTANT = Growth(first=1000, last=1000, start=0.0, stop=0.5, power=0.5)
 

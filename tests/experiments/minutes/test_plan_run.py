@@ -7,8 +7,7 @@ import pytest
 from tiny import composed
 
 from gsx.core.errors import ConfigError
-from gsx.experiments.minutes.cost import Measurement
-from gsx.experiments.minutes.options import plan_options
+from gsx.experiments.minutes.cost import Measurement, plan_options
 from gsx.experiments.minutes.plan import Task, changes_of, drawn_pixels, plan_run, training_seconds
 
 MEASURED = Measurement(

@@ -12,8 +12,7 @@ from tiny import OVERRIDES, final_tensors
 from gsx.builtin import plugins
 from gsx.core.errors import CompilerError, ConfigError, InputError
 from gsx.core.training.run import Run
-from gsx.experiments.minutes import probe
-from gsx.experiments.minutes.options import plan_options
+from gsx.experiments.minutes.cost import plan_options
 from gsx.experiments.minutes.planned import (
     keys_of,
     planned,
@@ -23,7 +22,7 @@ from gsx.experiments.minutes.planned import (
     without_length,
 )
 from gsx.experiments.minutes.probe import measure, quiet
-from gsx.experiments.runs import job
+from gsx.experiments.runs import job, rasterizer_path
 from gsx.experiments.runs.compose import compose
 
 WORDS = (*OVERRIDES, "backbone.published_iterations=12", "rasterizer=eager", "scene.points=120", "eval.zoom=[1]")
@@ -126,7 +125,7 @@ def test_a_failing_compiler_leaves_the_eager_path(tmp_path: Path, monkeypatch: p
     def fail(run: Run) -> None:
         raise CompilerError("no compiler")
 
-    monkeypatch.setattr(probe, "warm", fail)
+    monkeypatch.setattr(rasterizer_path, "warm", fail)
     words, loaded = [word for word in WORDS if word != "rasterizer=eager"], plugins()
     settings = compose([*words, f"folder={tmp_path}"], loaded)
     measurement, _ = measure(settings, {}, plan_options().probe, loaded)

@@ -16,13 +16,13 @@ from torch import Tensor
 
 from gsx.builtin import plugins
 from gsx.cli.dispatch import main
-from gsx.cli.prepare_arguments import parse_prepare
+from gsx.cli.program_arguments import parse_prepare
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import header_of, read_image, write_image
 from gsx.core.data.scene import Scene, View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import read_json
-from gsx.experiments.evaluation.protocol import protocol_of
+from gsx.experiments.evaluation.eval_options import protocol_of
 from gsx.experiments.prepare import prepare as prepared
 from gsx.experiments.prepare.picture_names import file_names
 from gsx.experiments.runs.compose import compose

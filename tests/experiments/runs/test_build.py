@@ -70,7 +70,7 @@ def test_compiled_code_is_kept_in_an_entry_of_the_cache_or_where_torch_keeps_it(
 def test_the_compiler_takes_the_settings_that_hasten_it() -> None:
     """In a process of its own: torch reads them once."""
     code = (
-        "from gsx.experiments.runs.build import hasten_compiling; hasten_compiling(); "
+        "from gsx.experiments.runs.build import keep_compiled_code; keep_compiled_code(); "
         "from torch._dynamo import config as tracing; from torch._inductor import config as writing; "
         "print(tracing.fake_tensor_cache_enabled, writing.cpp.vec_isa_ok)"
     )

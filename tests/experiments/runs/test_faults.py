@@ -30,8 +30,7 @@ from gsx.core.training.run import Run
 from gsx.engine.compiling import available
 from gsx.experiments.run_folder import checkpoint
 from gsx.experiments.run_folder.files import read_run, state_of
-from gsx.experiments.runs import execute as execution
-from gsx.experiments.runs import verified
+from gsx.experiments.runs import rasterizer_path, verified
 from gsx.experiments.runs.execute import execute
 from gsx.experiments.runs.job import train
 from gsx.experiments.runs.open import open_run, start
@@ -81,8 +80,8 @@ def at_call(number: int, function: Callable[..., Any], error: BaseException) -> 
         (trainer, "photometric", 6, torch.OutOfMemoryError("none")),
         (trainer, "photometric", 6, KeyboardInterrupt()),
         (trainer, "photometric", 6, OSError(5, "unreadable")),
-        (execution, "warm", 1, KeyboardInterrupt()),  # while code is compiled: before the first step
-        (execution, "warm", 1, CompilerError("blend cannot be compiled")),
+        (rasterizer_path, "warm", 1, KeyboardInterrupt()),  # while code is compiled: before the first step
+        (rasterizer_path, "warm", 1, CompilerError("blend cannot be compiled")),
     ],
 )
 def test_an_error_within_a_step_keeps_the_step_before(
@@ -109,7 +108,8 @@ def test_a_run_that_asked_for_no_code_goes_eagerly_where_it_cannot_be_compiled(
     tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A disk of the cache that is full, say."""
-    monkeypatch.setattr(execution, "warm", at_call(1, execution.warm, CompilerError("blend cannot be compiled (full)")))
+    failing = at_call(1, rasterizer_path.warm, CompilerError("blend cannot be compiled (full)"))
+    monkeypatch.setattr(rasterizer_path, "warm", failing)
     tiny_run(tmp_path / "run", (*SHORT, "rasterizer.path=auto", "rasterizer.auto_steps=1"))
     assert "blend cannot be compiled (full); using the eager path" in caplog.text
     assert json.loads((tmp_path / "run" / "environment.json").read_text())["rasterizer"] == "eager"

@@ -14,8 +14,8 @@ from tiny import leave_results
 from gsx.engine.cache import source_revision
 from gsx.experiments.run_folder.files import read_run, state_of
 from gsx.experiments.tables.plan import Cell, Experiment
-from gsx.experiments.tables.protocol_differences import protocol_differences
 from gsx.experiments.tables.published import Published
+from gsx.experiments.tables.sweep import protocol_differences
 from gsx.experiments.tables.table import Table, measured, table_of
 from gsx.experiments.tables.table_text import as_csv, as_latex, as_markdown, as_text
 

@@ -21,7 +21,7 @@ from gsx.experiments.runs.open import open_run
 from gsx.experiments.runs.overrides import words_of
 from gsx.experiments.runs.saved_settings import read_config
 from gsx.experiments.runs.settings import COMPETITOR, SEVERAL, Settings
-from gsx.scenes.blocks import Cell, parsed_block, scene_cells
+from gsx.scenes.blocks import parsed_block, scene_cells
 
 logger = logging.getLogger(__name__)
 
@@ -53,10 +53,15 @@ def merge_blocks(folders: Sequence[Path], path: Path, plugins: Plugins) -> list[
     parts, run = list[Gaussians](), None
     for block, cell in zip(blocks, cells, strict=True):
         run, _ = open_run(block.folder, plugins)
-        parts.append(in_cell(explicit_of(run, None) or bake(run), cell, block.settings.resolved["scene"]["block"]))
+        gaussians = explicit_of(run, None) or bake(run)
+        inside = cell.holds(gaussians.means.detach().cpu())
+        word = block.settings.resolved["scene"]["block"]
+        logger.info("block %s: %d of %d splats are in its cell", word, int(inside.sum()), len(inside))
+        parts.append(Gaussians(**{name: value.detach().cpu()[inside] for name, value in vars(gaussians).items()}))
     assert run is not None
     write_model(run, joined(parts), path, [f"merged of {len(parts)} blocks"])
-    return scene_words(whole)
+    scene, zooms = dict(whole.resolved["scene"]), whole.resolved["eval"]["zoom"]
+    return [f"scene={scene.pop('name')}", *words_of({"scene": scene, "eval": {"zoom": zooms}})]
 
 
 def settings_of(folder: Path, plugins: Plugins, overrides: Sequence[str] = ()) -> Settings:
@@ -106,19 +111,6 @@ def drawn_alike(settings: Settings) -> dict[str, Any]:
     rules = ("rasterizer.dilation", "rasterizer.compensate", "backbone.name", "backbone.filter")
     scene = {key: value for key, value in values.items() if key.startswith("scene.") and key not in FREE}
     return scene | {key: values[key] for key in rules if key in values}
-
-
-def scene_words(settings: Settings) -> list[str]:
-    """Returns the words that choose the scene of a run, and the zooms of its evaluation."""
-    scene, zooms = dict(settings.resolved["scene"]), settings.resolved["eval"]["zoom"]
-    return [f"scene={scene.pop('name')}", *words_of({"scene": scene, "eval": {"zoom": zooms}})]
-
-
-def in_cell(gaussians: Gaussians, cell: Cell, block: str) -> Gaussians:
-    """Returns the splats whose means are in a cell, on the CPU."""
-    inside = cell.holds(gaussians.means.detach().cpu())
-    logger.info("block %s: %d of %d splats are in its cell", block, int(inside.sum()), len(inside))
-    return Gaussians(**{name: value.detach().cpu()[inside] for name, value in vars(gaussians).items()})
 
 
 def joined(parts: Sequence[Gaussians]) -> Gaussians:

@@ -9,13 +9,11 @@ from statistics import fmean
 from tempfile import TemporaryDirectory
 
 import torch
-from torch import Tensor
 
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError, first_line
 from gsx.core.gaussians.splats import Gaussians, splats_of
 from gsx.core.quality.metrics import psnr
-from gsx.core.shapes import Float
 from gsx.core.training.importance import ROUNDING
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
@@ -32,24 +30,24 @@ def zoomed_psnr(
     run: Run, views: Sequence[View], zooms: Sequence[float], gaussians: Gaussians | None = None
 ) -> dict[str, float]:
     """Returns mean PSNR over views by zoom, dB; zooms without truth are left out. `gaussians` replace the model."""
+
+    def level(view: View) -> float:
+        """Compares a render at the exposure of its photo with that photo."""
+        splats = None if gaussians is None else splats_of(gaussians, view.camera.centre)
+        image = run.as_photo(render(run, view.camera, splats=splats).image, view).clamp(0, 1).cpu()
+        return above_rounding(psnr(image, view.image(), view.counted()))
+
     out = {}
     for factor in zooms:
         closer = [zoomed for view in views if (zoomed := view.zoom(factor)) is not None]
         if closer:
-            values = [psnr(photo_like(run, v, gaussians), v.image(), v.counted()) for v in closer]
-            out[f"{factor:g}"] = fmean(above_rounding(value) for value in values)
+            out[f"{factor:g}"] = fmean(map(level, closer))
     return out
 
 
 def above_rounding(decibels: float) -> float:
     """Adds the rounding of photos to 8 bits to the squared error of a PSNR: 58.9 dB at most."""
     return -10 * math.log10(10 ** (-decibels / 10) + ROUNDING)
-
-
-def photo_like(run: Run, view: View, gaussians: Gaussians | None) -> Float[Tensor, "3 H W"]:
-    """Renders a view by the model, or by other Gaussians, at the exposure of its photo."""
-    splats = None if gaussians is None else splats_of(gaussians, view.camera.centre)
-    return run.as_photo(render(run, view.camera, splats=splats).image, view).clamp(0, 1).cpu()
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from torch import Tensor
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.quality.metrics import decibel
-from gsx.core.shapes import Float, Int
+from gsx.core.shapes import Float
 from gsx.experiments.evaluation.chosen_views import evenly, neighbour
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.warp import Surface, places_in, warped
@@ -59,17 +59,13 @@ class Sums:
     powers: tuple[float, float] = (0.0, 0.0)
     """Squares of the detail, of the warped picture and of the other."""
 
-    def add(self, source: Float[Tensor, "3 H W"], target: Float[Tensor, "3 H W"], match: "Match") -> None:
-        """Warps a picture and compares it with another."""
-        one, other = match.colours(source, target)
+    def add(self, one: Float[Tensor, "3 P"], other: Float[Tensor, "3 P"]) -> None:
+        """Compares the colours of pixels by the warped picture and by the other."""
         self.squares += float((one - other).square().sum())
-        self.pixels += len(match.indices)
+        self.pixels += one.shape[1]
 
-    def add_detail(
-        self, source: Float[Tensor, "3 H W"], target: Float[Tensor, "3 H W"], match: "Match", size: tuple[int, int]
-    ) -> None:
-        """Warps the detail of a picture and compares it with that of another."""
-        one, other = match.colours(detail_layer(source, size), detail_layer(target, size))
+    def add_detail(self, one: Float[Tensor, "3 P"], other: Float[Tensor, "3 P"]) -> None:
+        """Compares the detail of pixels in both pictures."""
         self.products += float((one * other).sum())
         self.powers = self.powers[0] + float(one.square().sum()), self.powers[1] + float(other.square().sum())
 
@@ -83,22 +79,6 @@ class Sums:
         """Returns the correlation of both pictures' detail; 0 without any."""
         power = math.sqrt(self.powers[0] * self.powers[1])
         return self.products / power if power > 0 else 0.0
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Match:
-    """Pixels of a view that another view shows as well."""
-
-    indices: Int[Tensor, "P"]
-    """Row-major indices."""
-    places: Float[Tensor, "2 P"]
-    """Their places in the other view, px."""
-
-    def colours(
-        self, source: Float[Tensor, "3 H W"], target: Float[Tensor, "3 H W"]
-    ) -> tuple[Float[Tensor, "3 P"], Float[Tensor, "3 P"]]:
-        """Returns the colours of the pixels by the other view's picture, and by their own, float64."""
-        return warped(source, self.places), target.flatten(1)[:, self.indices].double()
 
 
 def detail_layer(picture: Float[Tensor, "3 H W"], size: tuple[int, int]) -> Float[Tensor, "3 H W"]:
@@ -128,12 +108,16 @@ class Consistency:
     def add(self, source: SurfaceView, target: SurfaceView) -> None:
         """Warps the source's pictures into the target and compares them with its own."""
         indices, places = places_in(source.surface, target.surface)
-        match, detailed = Match(indices=indices, places=places), not (source.masked or target.masked)
+        detailed = not (source.masked or target.masked)
+
+        def matched(one: Float[Tensor, "3 H W"], other: Float[Tensor, "3 H W"]) -> tuple[Tensor, Tensor]:
+            return warped(one, places), other.flatten(1)[:, indices].double()
+
         for name in target.stored.keys() & source.stored.keys():
             sums, pictures = self.sums.setdefault(name, Sums()), (source.picture(name), target.picture(name))
-            sums.add(*pictures, match)
+            sums.add(*matched(*pictures))
             if detailed:
-                sums.add_detail(*pictures, match, target.size)
+                sums.add_detail(*matched(*(detail_layer(picture, target.size) for picture in pictures)))
         self.detailed |= detailed
         self.pixels += len(indices)
         self.total += target.surface.visible.numel()
@@ -184,22 +168,13 @@ class CrossViews:
             return
         kept = self.kept[zoomed.factor]
         kept[view] = self.surface_view(zoomed, view)
-        for pair in [(one, other) for one, other in pairs if one in kept and (other in kept or self.trained(other))]:
-            one, other = pair
-            self.found[zoomed.factor].add(kept[one], kept.get(other) or self.neighbour_view(other, zoomed.factor))
-            pairs.remove(pair)
+        for one, other in [p for p in pairs if p[0] in kept and (p[1] in kept or p[1] not in self.test)]:
+            rendered = None if other in kept else self.zoom(other, zoomed.factor)
+            neighbouring = kept[other] if rendered is None else self.surface_view(rendered, other)
+            self.found[zoomed.factor].add(kept[one], neighbouring)
+            pairs.remove((one, other))
         for done in kept.keys() - {one for pair in pairs for one in pair}:
             del kept[done]
-
-    def trained(self, view: View) -> bool:
-        """Returns whether a view is none of those held out."""
-        return view not in self.test
-
-    def neighbour_view(self, view: View, factor: float) -> SurfaceView:
-        """Renders a training view."""
-        zoomed = self.zoom(view, factor)
-        assert zoomed is not None, "neighbours have a truth at that zoom"
-        return self.surface_view(zoomed, view)
 
     def surface_view(self, zoomed: Zoomed, view: View) -> SurfaceView:
         """Returns a zoomed view with what is visible in it."""

@@ -25,12 +25,11 @@ from gsx.core.training.run import Run
 from gsx.experiments.evaluation.chosen_views import evenly
 from gsx.experiments.evaluation.competitor import Competitor
 from gsx.experiments.evaluation.cross_view import CrossViews
-from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.eval_options import EvalOptions, protocol_of
 from gsx.experiments.evaluation.evaluated_renders import EvaluatedRenders
 from gsx.experiments.evaluation.fitted_views import fitted_figures, fitted_summary
 from gsx.experiments.evaluation.lpips import load_lpips
-from gsx.experiments.evaluation.perceptual import MetricSettings, at_training_size, load_metrics
-from gsx.experiments.evaluation.protocol import protocol_of
+from gsx.experiments.evaluation.perceptual import MetricSettings, at_training_size, load_metrics, mean_of
 from gsx.experiments.evaluation.remarks import NOT_MEASURED, gathered, module_remarks, module_summaries
 from gsx.experiments.evaluation.surface_errors import surface_summary
 from gsx.experiments.evaluation.zoom_figures import ZoomFigures, measure_zoom, zoom_result
@@ -49,32 +48,9 @@ def peak_memory_mb(device: torch.device) -> float | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
-def mean(values: Sequence[float | None]) -> float | None:
-    """Returns the mean, or None where a value is missing."""
-    known = [value for value in values if value is not None]
-    return statistics.fmean(known) if known and len(known) == len(values) else None
-
-
-def highest(values: Sequence[float | None]) -> float | None:
-    """Returns the largest known value, or None."""
-    return max((value for value in values if value is not None), default=None)
-
-
-def group_figures(views: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-    """Returns means over the views of a group."""
-    keys = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips", "visible_primitives": "visible"}
-    return {name: mean([view[key] for view in views]) for name, key in keys.items()}
-
-
-def view_entry(view: dict[str, Any], figures: Sequence[str]) -> dict[str, Any]:
-    """Returns a view's entry in evaluation.json."""
-    return {key: view[key] for key in ("name", "group", *figures, "perceptual")} | view["surface"] | view["fitted"]
-
-
-def metric_settings(run: Run, options: EvalOptions) -> MetricSettings:
-    """Returns what the perceptual metrics of a run need."""
-    pixels, ranges = options.perceptual_pixels, options.lpips.input_range
-    return MetricSettings(input_range=ranges, pixels=pixels, device=run.device, photos=run.scene.train)
+def means(views: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str, float | None]:
+    """Returns the means of some figures over views."""
+    return {name: mean_of([view[name] for view in views]) for name in names}
 
 
 Advance = Callable[[float, str], None]
@@ -91,7 +67,9 @@ class Evaluator:
     def __init__(self, run: Run, options: EvalOptions, competitor: Competitor | None = None) -> None:
         self.run, self.options, self.competitor = run, options, competitor
         self.lpips, self.renders = load_lpips(options.lpips), EvaluatedRenders(run, options)
-        self.perceptual = load_metrics(options.perceptual, metric_settings(run, options))
+        ranges, pixels, photos = options.lpips.input_range, options.perceptual_pixels, run.scene.train
+        inputs = MetricSettings(input_range=ranges, pixels=pixels, device=run.device, photos=photos)
+        self.perceptual = load_metrics(options.perceptual, inputs)
         self.times: list[float] = []
         """Seconds of each render at the training resolution, without its way to the CPU."""
         self.kept: dict[View, Tensor] = {}
@@ -116,7 +94,7 @@ class Evaluator:
             "perceptual": self.perceptual.view(*parts),
             "surface": self.renders.surface_errors(view, evaluated),
             "fitted": fitted_figures(self.run, view, tiled.image, self.options),
-            "visible": int(tiled.visible.sum()),
+            "visible_primitives": int(tiled.visible.sum()),
             "left_out": tiled.dropped,
         }
 
@@ -220,17 +198,18 @@ class Evaluator:
         groups = sorted({v["group"] for v in views if v["group"]})
         by_group = {name: [v for v in views if v["group"] == name] for name in groups}
         figures = ("psnr", "ssim", "lpips")
+        own = ("name", "group", *figures, "perceptual")
+        memory = [peak_memory_mb(run.device), *(line.get("memory_mb") for line in curves)]
         if drawing is not None:
             drawing.choose(views)
         evaluation = {
             "protocol": protocol_of(run.scene, self.options, self.lpips.name if self.lpips else "n/a (no weights)"),
             "step": run.step,
-            **{key: mean([v[key] for v in views]) for key in figures},
+            **means(views, figures),
             **self.perceptual.summary(views),
             **self.perceptual.provenance,
             "primitives": primitives,
-            "visible_primitives": mean([v["visible"] for v in views]),
-            "left_out": mean([v["left_out"] for v in views]),
+            **means(views, ("visible_primitives", "left_out")),
             **surface_summary(views),
             **fitted_summary(views),
             **gathered(curves),
@@ -239,13 +218,14 @@ class Evaluator:
             "render_fps": self.frames_per_second(),
             "render_path": run.raster.path_on(run.device.type),
             "train_seconds": run.progress.seconds,
-            "peak_memory_mb": highest(
-                [peak_memory_mb(run.device), *(line.get("memory_mb") for line in run.progress.curves)]
-            ),
-            "groups": {name: group_figures(vs) | self.perceptual.summary(vs) for name, vs in by_group.items()},
+            "peak_memory_mb": max((value for value in memory if value is not None), default=None),
+            "groups": {
+                name: means(some, (*figures, "visible_primitives")) | self.perceptual.summary(some)
+                for name, some in by_group.items()
+            },
             **({"competitor": self.competitor.provenance()} if self.competitor else {}),
             "zoom": self.zooms(views, drawing, advance),
-            "views": [view_entry(v, figures) for v in views],
+            "views": [{key: v[key] for key in own} | v["surface"] | v["fitted"] for v in views],
         }
         return evaluation | module_remarks(run, evaluation)
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from gsx.core.errors import InputError
 from gsx.experiments.evaluation.feature_distance import FeatureDistance
-from gsx.experiments.evaluation.weight_files import read_weights
+from gsx.experiments.evaluation.weights import read_weights
 
 Layer: TypeAlias = tuple[int, int, int, int]
 """Convolution: channels, kernel, stride, padding; a ReLU follows."""

@@ -16,7 +16,7 @@ from torch.nn.functional import conv2d, pad
 
 from gsx.core.quality.metrics import bicubic
 from gsx.core.shapes import Float
-from gsx.experiments.evaluation.installed_weights import MetricUnavailable
+from gsx.experiments.evaluation.weights import MetricUnavailable
 
 PATCH = 96
 """Edge of a patch, px; half of it at the coarse scale."""
@@ -120,7 +120,8 @@ def scale_features(luma: Float[Tensor, "1 H W"], edge: int) -> tuple[Float[Tenso
     normalised, contrast = normalise(255 * luma)
     patches = patches_of(normalised, edge)
     products = [patches * patches.roll(shift, (1, 2)) for shift in NEIGHBOURS]
-    features = [luminance_features(patches), *map(product_features, products)]
+    shape, left, right = fit(patches)
+    features = [torch.stack([shape, (left + right) / 2], 1), *map(product_features, products)]
     return torch.cat(features, 1), patches_of(contrast, edge).mean((1, 2))
 
 
@@ -145,12 +146,6 @@ def patches_of(picture: Float[Tensor, "1 H W"], edge: int) -> Float[Tensor, "P e
     return picture[0].unfold(0, edge, edge).unfold(1, edge, edge).reshape(-1, edge, edge)
 
 
-def luminance_features(patches: Float[Tensor, "P e e"]) -> Float[Tensor, "P 2"]:
-    """Returns shape and mean scale of the fitted distribution."""
-    shape, left, right = fit(patches)
-    return torch.stack([shape, (left + right) / 2], 1)
-
-
 def product_features(patches: Float[Tensor, "P e e"]) -> Float[Tensor, "P 4"]:
     """Returns shape, mean, and both scales of the fitted distribution."""
     shape, left, right = fit(patches)
@@ -166,7 +161,8 @@ def fit(patches: Float[Tensor, "P e e"]) -> tuple[Float[Tensor, "P"], Float[Tens
     Source: Lasmar, Stitou and Berthoumieu 2009.
     """
     values = patches.flatten(1)
-    left, right = (side_deviation(values, sign) for sign in (values < 0, values > 0))
+    sides = (values < 0, values > 0)
+    left, right = (((values.square() * side).sum(1) / side.sum(1)).sqrt() for side in sides)  # root mean squares
     ratio = left / right
     ratio_of_moments = values.abs().mean(1).square() / values.square().mean(1)
     target = ratio_of_moments * (ratio**3 + 1) * (ratio + 1) / (ratio**2 + 1).square()
@@ -174,11 +170,6 @@ def fit(patches: Float[Tensor, "P e e"]) -> tuple[Float[Tensor, "P"], Float[Tens
     shape = shapes[(moments - target[:, None]).abs().argmin(1)]
     scale = torch.exp((torch.lgamma(1 / shape) - torch.lgamma(3 / shape)) / 2)
     return shape, left * scale, right * scale
-
-
-def side_deviation(values: Float[Tensor, "P N"], side: Tensor) -> Float[Tensor, "P"]:
-    """Returns the root mean square of the values of one side."""
-    return ((values.square() * side).sum(1) / side.sum(1)).sqrt()
 
 
 @cache

@@ -14,12 +14,11 @@ from gsx.core.data.masks import black_out
 from gsx.core.data.scene import View
 from gsx.core.shapes import Float
 from gsx.experiments.evaluation.chosen_views import evenly
-from gsx.experiments.evaluation.feature_distance import FeatureDistance
-from gsx.experiments.evaluation.installed_weights import InstalledWeights, MetricUnavailable, installed_weights
+from gsx.experiments.evaluation.feature_distance import FeatureDistance, WindowedDistance
 from gsx.experiments.evaluation.lpips import lpips_from
 from gsx.experiments.evaluation.niqe import niqe_of
 from gsx.experiments.evaluation.st_lpips import shift_tolerant_lpips
-from gsx.experiments.evaluation.windowed import WindowedDistance
+from gsx.experiments.evaluation.weights import InstalledWeights, MetricUnavailable, installed_weights
 from gsx.experiments.evaluation.zoomed import Zoomed
 
 logger = logging.getLogger(__name__)
@@ -103,9 +102,10 @@ class PerceptualMetrics:
         return {"perceptual": {name: mean_of([one[name] for one in figures if name in one]) for name in self.names}}
 
 
-def mean_of(values: Sequence[float]) -> float | None:
-    """Returns the mean; None of none."""
-    return statistics.fmean(values) if values else None
+def mean_of(values: Sequence[float | None]) -> float | None:
+    """Returns the mean; None: a value is missing, or there are none."""
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known and len(known) == len(values) else None
 
 
 def at_training_size(view: Mapping[str, float]) -> Figures:

@@ -83,32 +83,30 @@ def remarks_on(findings: Sequence[Finding], exposures: str, learnt: bool, correc
     remedy = f"training.exposure.when={'auto' if exposures == 'never' else 'always'} learns exposures"
     exposure = "its exposure was learnt" if learnt else remedy
     pose = "even with its pose corrected" if corrected else "training.poses.when=always corrects poses"
-    return [list(remarks(one, stops, distance, concentration, quality, exposure, pose)) for one in findings]
+
+    def remarks(one: Finding) -> Iterator[str]:
+        if one.gains and one.stops is not None:
+            brighter, balance = one.stops - stops, max(one.gains) - min(one.gains)
+            if abs(brighter) > UNEVEN:
+                than = f"{'brighter' if brighter > 0 else 'darker'} than the others"
+                yield f"{abs(brighter):.2f} stops {than}: {exposure}"
+            if balance > UNEVEN:
+                yield f"its colours are balanced otherwise, channels by up to {balance:.2f} stops: {exposure}"
+        if one.shift and one.distance is not None and one.distance >= max(SHIFTED, TIMES * distance):
+            x, y = one.shift
+            yield f"it is displaced by {one.distance:.1f} px from its render ({x:+.1f} across, {y:+.1f} down): {pose}"
+        if one.sharpness is not None and one.sharpness < BLURRED:
+            yield f"it has {one.sharpness:.2f} of its neighbours' fine contrast: blurred, leave it out or take it again"
+        if one.concentrated >= max(ELSEWHERE, MORE * concentration) and one.psnr < quality:
+            yield (
+                f"{one.concentrated:.0%} of its error lies in {FEW:.0%} of it: if only this photograph shows what is "
+                "there, mask it (masks/)"
+            )
+
+    return [list(remarks(one)) for one in findings]
 
 
 def usual(values: Sequence[float | None]) -> float:
     """Returns the median of the known values; 0 of none."""
     known = [value for value in values if value is not None]
     return median(known) if known else 0.0
-
-
-def remarks(
-    one: Finding, stops: float, distance: float, concentration: float, psnr: float, exposure: str, pose: str
-) -> Iterator[str]:
-    """Yields the faults of a photo from the medians of all photos, with their remedies."""
-    if one.gains and one.stops is not None:
-        brighter, balance = one.stops - stops, max(one.gains) - min(one.gains)
-        if abs(brighter) > UNEVEN:
-            yield f"{abs(brighter):.2f} stops {'brighter' if brighter > 0 else 'darker'} than the others: {exposure}"
-        if balance > UNEVEN:
-            yield f"its colours are balanced otherwise, channels by up to {balance:.2f} stops: {exposure}"
-    if one.shift and one.distance is not None and one.distance >= max(SHIFTED, TIMES * distance):
-        x, y = one.shift
-        yield f"it is displaced by {one.distance:.1f} px from its render ({x:+.1f} across, {y:+.1f} down): {pose}"
-    if one.sharpness is not None and one.sharpness < BLURRED:
-        yield f"it has {one.sharpness:.2f} of its neighbours' fine contrast: blurred, leave it out or take it again"
-    if one.concentrated >= max(ELSEWHERE, MORE * concentration) and one.psnr < psnr:
-        yield (
-            f"{one.concentrated:.0%} of its error lies in {FEW:.0%} of it: if only this photograph shows what is "
-            "there, mask it (masks/)"
-        )

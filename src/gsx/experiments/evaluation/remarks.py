@@ -77,13 +77,12 @@ def totals(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Sums requested pictures, shares dropped and shares warned of, by scale, over the events of an augmenter."""
     sums = sum_accounts(events)
     requested = sums["asked"]
-    warned = {check: shares(counts, requested) for check, counts in sums["warned"].items()}
-    return {"asked": requested, "dropped": shares(sums["dropped"], requested), "warned": warned}
 
+    def shares(counts: Mapping[str, int]) -> dict[str, float]:
+        return {scale: counts.get(scale, 0) / count for scale, count in requested.items()}
 
-def shares(counts: Mapping[str, int], requested: Mapping[str, int]) -> dict[str, float]:
-    """Returns counts by scale as shares of what was requested at that scale."""
-    return {scale: counts.get(scale, 0) / count for scale, count in requested.items()}
+    warned = {check: shares(counts) for check, counts in sums["warned"].items()}
+    return {"asked": requested, "dropped": shares(sums["dropped"]), "warned": warned}
 
 
 def remarks_of(evaluation: Mapping[str, Any]) -> list[str]:
@@ -92,52 +91,40 @@ def remarks_of(evaluation: Mapping[str, Any]) -> list[str]:
 
 
 def incidents_of(evaluation: Mapping[str, Any]) -> list[str]:
-    """Returns remarks on an evaluation.json; none for a run without incident."""
-    kinds = (split_remarks, start_remarks, cap_remarks, pseudo_remarks, left_out_remarks, saved_remarks)
-    return [remark for kind in kinds for remark in kind(evaluation)]
+    """Returns remarks on an evaluation.json; none for a run without incident.
+
+    Remarks of the run's modules are saved with it; for older evaluations they are computed now.
+    """
+    cap, count = evaluation.get("withheld"), evaluation.get("left_out") or 0
+    doubts = evaluation.get("start")
+    remarks = [NOT_MEASURED] if measures_nothing(evaluation) else []
+    remarks += map(str, doubts if isinstance(doubts, list) else [])
+    if cap:
+        words = f"from step {cap['step']:,} on: the model may be too small"
+        remarks.append(f"growth is held at backbone.max_primitives {words}")
+    for name, facts in (evaluation.get("pseudo") or {}).items():
+        remarks += pseudo_remarks(name, facts)
+    if count:
+        remarks.append(f"renders leave out {count:,.1f} splats a view, whose values cannot be drawn")
+    if "remarks" in evaluation:
+        return [*remarks, *map(str, evaluation["remarks"])]
+    return [*remarks, *(remark for module, _ in MODULES.values() for remark in module.remarks(evaluation))]
 
 
-def split_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a remark if no view is held out."""
-    if measures_nothing(evaluation):
-        yield NOT_MEASURED
+def pseudo_remarks(name: str, facts: Mapping[str, Any]) -> Iterator[str]:
+    """Yield remarks on pictures of pseudo views that were dropped or that a check warned of."""
+    for scale, share in facts["dropped"].items():
+        if share > 0:
+            yield f"{name} lost {share:.1%} of its x{scale} pictures"
+    for check, by_scale in facts.get("warned", {}).items():
+        for scale, share in by_scale.items():
+            if share > 0:
+                yield f"{share:.1%} of {name}'s x{scale} pictures {CHECKS.get(check, check)}"
 
 
 def measures_nothing(evaluation: Mapping[str, Any]) -> bool:
     """Return whether an evaluation is that of a run without test views."""
     return evaluation.get("views") == [] and evaluation.get("psnr") is None
-
-
-def start_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    """Yield why the splat file that a run begins with may not belong to its scene."""
-    doubts = evaluation.get("start")
-    yield from (str(doubt) for doubt in (doubts if isinstance(doubts, list) else []))
-
-
-def cap_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a remark if growth was held at the cap."""
-    cap = evaluation.get("withheld")
-    if cap:
-        yield f"growth is held at backbone.max_primitives from step {cap['step']:,} on: the model may be too small"
-
-
-def pseudo_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    """Yield remarks on pictures of pseudo views that were dropped or that a check warned of."""
-    for name, facts in (evaluation.get("pseudo") or {}).items():
-        for scale, share in facts["dropped"].items():
-            if share > 0:
-                yield f"{name} lost {share:.1%} of its x{scale} pictures"
-        for check, by_scale in facts.get("warned", {}).items():
-            for scale, share in by_scale.items():
-                if share > 0:
-                    yield f"{share:.1%} of {name}'s x{scale} pictures {CHECKS.get(check, check)}"
-
-
-def left_out_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a remark if held-out renders lack splats."""
-    count = evaluation.get("left_out") or 0
-    if count:
-        yield f"renders leave out {count:,.1f} splats a view, whose values cannot be drawn"
 
 
 def upscaler_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
@@ -147,12 +134,3 @@ def upscaler_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
     if lost:
         name = upscaler_of(dict(evaluation))
         yield f"zoomed renders lose to the x1 render enlarged by {name} at {', '.join(lost)}: zoom by that instead"
-
-
-def saved_remarks(evaluation: Mapping[str, Any]) -> Iterator[str]:
-    """Yields the saved remarks of the run's modules; for older evaluations, remarks computed now."""
-    if "remarks" in evaluation:
-        yield from map(str, evaluation["remarks"])
-    else:
-        for module, _ in MODULES.values():
-            yield from module.remarks(evaluation)

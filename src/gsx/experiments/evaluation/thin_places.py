@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import View
-from gsx.core.shapes import Bool, Float
+from gsx.core.shapes import Float
 from gsx.experiments.evaluation.chosen_views import neighbour
 from gsx.experiments.evaluation.view_coverage import ENOUGH, Covered, SceneCoverage
 
@@ -110,7 +110,10 @@ def place_in(covered: Covered, held_out: bool) -> Place | None:
     thin = (covered.counts < ENOUGH) & solid
     if not len(thin):
         return None
-    inside = {part: within(covered.sampled.places, borders) & solid for part, borders in PARTS.items()}
+    places, inside = covered.sampled.places, {}
+    for part, borders in PARTS.items():
+        low, high = places.new_tensor(borders[:2]), places.new_tensor(borders[2:])
+        inside[part] = ((places >= low) & (places <= high)).all(1) & solid
     excess = {part: float((thin[rows].double() - THIN).sum()) / len(thin) for part, rows in inside.items()}
     part = max(excess, key=lambda name: excess[name])
     if excess[part] < LEAST:
@@ -119,12 +122,6 @@ def place_in(covered: Covered, held_out: bool) -> Place | None:
     point = covered.sampled.points[rows & thin].median(0).values
     share = float(thin[rows].double().mean())
     return Place(covered=covered, held_out=held_out, part=part, share=share, excess=excess[part], point=point)
-
-
-def within(places: Float[Tensor, "S 2"], borders: tuple[float, float, float, float]) -> Bool[Tensor, "S"]:
-    """Marks places inside borders: left, top, right, lower."""
-    low, high = places.new_tensor(borders[:2]), places.new_tensor(borders[2:])
-    return ((places >= low) & (places <= high)).all(1)
 
 
 def apart(place: Place, other: Place) -> bool:
@@ -139,16 +136,12 @@ def retake_of(place: Place, train: Sequence[View]) -> Retake:
     centre, axis = camera.centre.double(), camera.rotation[2].double()
     way = place.point - centre
     offset = (way - axis * (way @ axis)) if place.part else torch.zeros_like(way)
-    others = [view for view in train if view.name != place.view.name and ahead(view.camera, centre, offset)]
+    sides = {view.name: (view.camera.centre.double() - centre) @ offset for view in train}
+    others = [view for view in train if view.name != place.view.name and sides[view.name] >= 0]
     index = neighbour(moved_to(camera, centre + offset / 2), [view.camera for view in others])
     other = None if index is None else others[index]
     eye = centre if other is None else (centre + other.camera.centre.double()) / 2
     return Retake(place=place, neighbour=other, camera=towards(camera, eye, place.point))
-
-
-def ahead(camera: Camera, centre: Float[Tensor, "3"], offset: Float[Tensor, "3"]) -> bool:
-    """Returns whether a camera stands on the side of an offset from a centre."""
-    return bool((camera.centre.double() - centre) @ offset >= 0)
 
 
 def moved_to(camera: Camera, centre: Float[Tensor, "3"]) -> Camera:

@@ -26,6 +26,7 @@ from gsx.core.training.run import Run
 from gsx.experiments.evaluation.chosen_views import LARGEST_TURN, distinct
 from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluated_renders import depth_and_coverage
+from gsx.experiments.evaluation.perceptual import mean_of
 from gsx.experiments.evaluation.warp import Surface, points_of, project, surface_of
 from gsx.experiments.run_folder.files import part
 from gsx.experiments.run_folder.shapes import is_number
@@ -104,13 +105,14 @@ class SceneCoverage:
 
         views: its present entries of the test views. right: figures are of right halves.
         """
-        own = [one.figures(right) for one in self.test]
+        own, training = [one.figures(right) for one in self.test], [one.figures() for one in self.train]
+        classes = [class_of(one["coverage"]) for one in training if one["coverage"] is not None]
         entries = [view | figures for view, figures in zip(views, own, strict=True)]
         coverage = {
             "least_views": ENOUGH,
             **means(entries),
             "classes": by_class(entries),
-            "training": training_figures([one.figures() for one in self.train]),
+            "training": means(training) | {"classes": {name: classes.count(name) for name in CLASSES}},
         }
         return {"coverage": coverage, "views": entries}
 
@@ -126,29 +128,18 @@ def by_class(entries: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     groups = {name: [entry for entry in known if class_of(entry["coverage"]) == name] for name in CLASSES}
     figures = ("psnr", "ssim", "lpips")
     return {
-        name: {"from": CLASSES[name], "views": len(group), **{key: mean_of(group, key) for key in figures}}
+        name: {"from": CLASSES[name], "views": len(group)}
+        | {key: mean_of([entry.get(key) for entry in group]) for key in figures}
         | {"lowest_psnr": min((entry["psnr"] for entry in group), default=None)}
         for name, group in groups.items()
     }
 
 
-def training_figures(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Returns mean figures of training views by the others, and their number by class."""
-    classes = [class_of(entry["coverage"]) for entry in entries if entry["coverage"] is not None]
-    return means(entries) | {"classes": {name: classes.count(name) for name in CLASSES}}
-
-
 def means(entries: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     """Returns the means of both figures of coverage over the views that have them."""
     known = [entry for entry in entries if entry["coverage"] is not None]
-    return {"share": mean_of(known, "coverage"), "covering_views": mean_of(known, "covering_views")}
-
-
-def mean_of(entries: Sequence[dict[str, Any]], key: str) -> float | None:
-    """Returns the mean of a figure; None: there is no entry, or one lacks it."""
-    values = [entry.get(key) for entry in entries]
-    known = [value for value in values if value is not None]
-    return math.fsum(known) / len(known) if known and len(known) == len(values) else None
+    shares, views = ([entry[key] for entry in known] for key in ("coverage", "covering_views"))
+    return {"share": mean_of(shares), "covering_views": mean_of(views)}
 
 
 def coverage_of(run: Run, options: EvalOptions) -> SceneCoverage:
@@ -167,19 +158,15 @@ def coverage_lines(evaluation: Mapping[str, Any]) -> list[str]:
         return [f"coverage: n/a, {coverage['unavailable']}"]
     training = part(coverage, "training")
     if is_number(coverage.get("share")):
-        texts = [class_text(name, one) for name, one in part(coverage, "classes").items() if one["views"]]
+        classes = {LABELS[name]: one for name, one in part(coverage, "classes").items() if one["views"]}
+        levels = {label: "" if one["psnr"] is None else f" ({one['psnr']:.2f} dB)" for label, one in classes.items()}
+        texts = [f"{label} {one['views']}{levels[label]}" for label, one in classes.items()]
         shared = f"at least {coverage['least_views']} training views show {coverage['share']:.0%} of a test view"
         return [f"coverage: {shared}; test views {', '.join(texts)}"]
     if is_number(training.get("share")):
         others = f"at least {coverage['least_views']} other training views"
         return [f"coverage: {others} show {training['share']:.0%} of a training view"]
     return []
-
-
-def class_text(name: str, figures: Mapping[str, Any]) -> str:
-    """Returns the number of views of a class and their PSNR in words."""
-    quality = "" if figures["psnr"] is None else f" ({figures['psnr']:.2f} dB)"
-    return f"{LABELS[name]} {figures['views']}{quality}"
 
 
 def scene_coverage(train: Sequence[View], test: Sequence[View], draw: Render, far: float) -> SceneCoverage:
@@ -239,18 +226,14 @@ def count_covering(sampled: Sequence[Sampled], observers: int) -> list[Int[Tenso
     distances = rays.norm(dim=1)
     scales = focals[owners] / distances
     counts = torch.zeros(len(points), dtype=torch.int64)
-    poses = torch.stack([pose_of(one.view.camera) for one in sampled])
+    cameras = [one.view.camera for one in sampled]
+    poses = torch.stack([torch.cat([one.rotation.double().flatten(), one.translation.double()]) for one in cameras])
     for number, observer in enumerate(sampled[:observers]):
         own = (poses == poses[number]).all(1)
         near = alike(observer, points, rays, distances, scales) & ~own[owners]
         rows = near.nonzero()[:, 0]
         counts[rows[shows(observer, points[rows], empty[rows])]] += 1
     return list(counts.split(sizes))
-
-
-def pose_of(camera: Camera) -> Float[Tensor, "12"]:
-    """Returns rotation and translation of a camera in one row."""
-    return torch.cat([camera.rotation.double().flatten(), camera.translation.double()])
 
 
 def alike(

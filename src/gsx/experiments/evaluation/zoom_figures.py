@@ -1,7 +1,7 @@
 """Figures of a zoom: of the zoomed render and of its competitors, view by view and as means."""
 
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 from torch import Tensor
@@ -36,20 +36,15 @@ def measure_zoom(zoomed: Zoomed, ssim: Ssim, perceptual: Figures) -> ZoomFigures
     pictures = zoomed.pictures(DETAIL_OF)
     whole = zoomed.counted is None and zoomed.view.counted() is None
     details = details_of(pictures, zoomed.truth, zoomed.factor) if whole else {}
-    return ZoomFigures(zoomed.view.group, zoom_figures(zoomed, ssim), details, perceptual)
-
-
-def zoom_figures(zoomed: Zoomed, ssim: Ssim) -> dict[str, float]:
-    """Measures one view at a zoom, and its competitors."""
     truth, counted = zoomed.truth, zoomed.counted
     figures = {}
     for name, picture in zoomed.pictures(("render", "enlarged", "upscaled")).items():
         prefix = "" if name == "render" else f"{name}_"
         figures[f"{prefix}psnr"] = psnr(picture, truth, counted)
         figures[f"{prefix}ssim"] = ssim(picture, truth, counted)
-    if zoomed.photograph is None:
-        return figures
-    return figures | {"photograph_psnr": psnr(zoomed.photograph, truth, counted)}
+    if zoomed.photograph is not None:
+        figures["photograph_psnr"] = psnr(zoomed.photograph, truth, counted)
+    return ZoomFigures(zoomed.view.group, figures, details, perceptual)
 
 
 def zoom_result(factor: float, views: Sequence[ZoomFigures]) -> dict[str, Any]:
@@ -60,9 +55,10 @@ def zoom_result(factor: float, views: Sequence[ZoomFigures]) -> dict[str, Any]:
 
 
 def zoom_entry(factor: float, views: Sequence[ZoomFigures]) -> dict[str, Any]:
-    """Returns mean figures of views at one zoom with the verdicts, or the reason why there are none.
+    """Returns mean figures of views at one zoom, or the reason why there are none.
 
-    Figures that some of the views lack are left out.
+    Figures that some of the views lack are left out. `beats_RIVAL`: whether the zoomed render has the higher PSNR; None
+    at x1, where nothing differs.
     """
     if not views:
         return {"unavailable": f"the images hold no truth at x{factor:g}: train on a larger scene.downscale"}
@@ -72,10 +68,6 @@ def zoom_entry(factor: float, views: Sequence[ZoomFigures]) -> dict[str, Any]:
     shared = [name for name in known[0] if all(name in detail for detail in known)] if known else []
     found = {name: explained([detail[name] for detail in known]) for name in shared}
     perceptual = zoom_means([view.perceptual for view in views])
-    return means | {"views": len(views)} | verdicts(factor, means) | ({"detail": found} if found else {}) | perceptual
-
-
-def verdicts(factor: float, means: Mapping[str, float]) -> dict[str, bool | None]:
-    """Returns whether the zoomed render has a higher PSNR than each competitor; None at x1, where nothing differs."""
     rivals = [name for name in ("enlarged", "upscaled") if f"{name}_psnr" in means]
-    return {f"beats_{name}": None if factor == 1 else means["psnr"] > means[f"{name}_psnr"] for name in rivals}
+    beaten = {f"beats_{name}": None if factor == 1 else means["psnr"] > means[f"{name}_psnr"] for name in rivals}
+    return means | {"views": len(views)} | beaten | ({"detail": found} if found else {}) | perceptual

@@ -14,11 +14,10 @@ from gsx.core.files import replace_text, write_json
 from gsx.core.plugins import Plugins
 from gsx.engine.cache import source_revision
 from gsx.experiments.judge.methods import Entry
-from gsx.experiments.judge.page import page_of
+from gsx.experiments.judge.page import as_csv, as_text, page_of
 from gsx.experiments.judge.prepared_scenes import prepared_subject
 from gsx.experiments.judge.scene_figures import Choices, Subject, measure_scene
 from gsx.experiments.judge.summary import PLACE, baseline_of, named_methods, over_scenes, rows_of, view_rows
-from gsx.experiments.judge.tables import as_csv, as_text
 from gsx.experiments.prepare.whole_folder import refuse_occupied, whole_folder
 from gsx.experiments.runs.compose import Compositions
 
@@ -54,55 +53,37 @@ def compare_methods(
     Raises:
         ConfigError, InputError: a setting, a scene or a method cannot be measured; nothing is written.
     """
-    entries = numbered(entries)
-    baseline = baseline_of(list(dict.fromkeys(entry.name for entry in entries)), against)
-    refuse_equal_names(subjects)
+    names = [entry.name for entry in entries]
+    entries = [replace(entry, repetition=names[:number].count(entry.name)) for number, entry in enumerate(entries)]
+    baseline = baseline_of(list(dict.fromkeys(names)), against)
+    scenes = [subject.name for subject in subjects]
+    if twice := next((name for name in scenes if name and scenes.count(name) > 1), ""):
+        raise InputError(f"two of the prepared folders hold a scene called '{twice}': compare them one by one")
     place = Path("outputs") / "comparisons" / f"{datetime.now():%Y-%m-%d_%H-%M-%S}" if to is None else to
     refuse_occupied(place)
     with whole_folder(place) as folder:
         (folder / PICTURES).mkdir()
         results = []
         for number, (subject, name) in enumerate((s, p) for s in subjects for p in protocols or [""]):
+            measured = subject
             if name:
                 logger.info("protocol %s", name)
-            measured = with_protocol(subject, name, plugins)
+                measuring = measuring_words(subject.overrides, name, plugins)
+                measured = replace(subject, overrides=(*subject.overrides, *measuring))
             found = measure_scene(measured, entries, choices, plugins, folder / PICTURES, f"{number}")
             results.append({"protocol_name": name, **found})
         lines = write_results(folder, results, baseline, words)
     return place / PAGE, lines
 
 
-def numbered(entries: Sequence[Entry]) -> list[Entry]:
-    """Returns methods with repetitions of one name counted."""
-    counts: dict[str, int] = {}
-    out = []
-    for entry in entries:
-        out.append(replace(entry, repetition=counts.get(entry.name, 0)))
-        counts[entry.name] = counts.get(entry.name, 0) + 1
-    return out
-
-
-def refuse_equal_names(subjects: Sequence[Subject]) -> None:
-    """Raises InputError if two prepared scenes have one name."""
-    names = [subject.name for subject in subjects]
-    if twice := next((name for name in names if name and names.count(name) > 1), ""):
-        raise InputError(f"two of the prepared folders hold a scene called '{twice}': compare them one by one")
-
-
-def with_protocol(subject: Subject, protocol: str, plugins: Plugins) -> Subject:
-    """Returns a scene that a named protocol measures; empty: by the settings as they are.
+def measuring_words(overrides: Sequence[str], protocol: str, plugins: Plugins) -> list[str]:
+    """Returns the settings by which a protocol measures, as far as the scene has them.
 
     Its settings of sizes and splits do not count: pictures have their size, and the scene its test views.
 
     Raises:
         ConfigError: there is no such protocol.
     """
-    measuring = [] if not protocol else measuring_words(subject.overrides, protocol, plugins)
-    return replace(subject, overrides=(*subject.overrides, *measuring))
-
-
-def measuring_words(overrides: Sequence[str], protocol: str, plugins: Plugins) -> list[str]:
-    """Returns the settings by which a protocol measures, as far as the scene has them."""
     with Compositions(plugins) as compositions:
         measuring, known = compositions.protocol(protocol).measuring, compositions.keys(overrides)
     fitting = {key: value for key, value in measuring.items() if key in known and key != "eval.zoom"}

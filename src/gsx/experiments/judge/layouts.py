@@ -5,7 +5,7 @@ Sources: 3D-GS and its descendants, render.py; Mip-Splatting, render.py; nerfbas
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -58,8 +58,8 @@ def layout_of(folder: Path) -> Layout:
     Raises:
         InputError: there are no pictures.
     """
-    layouts = (inria(folder), nerfbaselines(folder), nerfstudio(folder), plain(folder))
-    found = next((layout for layout in layouts if layout is not None), None)
+    nerfbaselines = named_renders("nerfbaselines", folder / "color", folder / "gt-color")
+    found = inria(folder) or nerfbaselines or nerfstudio(folder) or plain(folder)
     if found is None:
         raise InputError(without_pictures(folder))
     return found
@@ -75,7 +75,12 @@ def without_pictures(folder: Path) -> str:
 
 def inria(folder: Path) -> Layout | None:
     """Recognises renders of 3D-GS and its descendants: MODEL/test/ours_N/renders, and gt."""
-    iterations = sorted([*folder.glob("test/ours_*"), *folder.glob("ours_*")], key=iteration_of)
+
+    def iteration(path: Path) -> int:
+        found = ITERATION.fullmatch(path.name)
+        return int(found[1]) if found else -1
+
+    iterations = sorted([*folder.glob("test/ours_*"), *folder.glob("ours_*")], key=iteration)
     place = iterations[-1] if iterations else folder
     folders = [path for path in subfolders(place) if RENDERS.fullmatch(path.name)]
     sets = [numbered_set(path, place) for path in folders if pictures_in(path)]
@@ -86,22 +91,11 @@ def inria(folder: Path) -> Layout | None:
     return Layout(program="3D-GS", sets=tuple(sets), notes=notes)
 
 
-def iteration_of(folder: Path) -> int:
-    """Returns the iteration in the name of a folder; -1: there is none."""
-    found = ITERATION.fullmatch(folder.name)
-    return int(found[1]) if found else -1
-
-
 def numbered_set(folder: Path, place: Path) -> PictureSet:
     """Returns renders whose names are numbers, with the photos of the same numbers."""
     files = pictures_in(folder)
     photos = "gt" if folder.name == "renders" else folder.name.replace("test_preds", "gt")
     return PictureSet(folder=folder, files=files, truths=partners(files, folder, place / photos), numbered=True)
-
-
-def nerfbaselines(folder: Path) -> Layout | None:
-    """Recognises predictions of nerfbaselines: color/ and gt-color/ by the names of photos."""
-    return named_renders("nerfbaselines", folder / "color", folder / "gt-color")
 
 
 def nerfstudio(folder: Path) -> Layout | None:
@@ -112,28 +106,24 @@ def nerfstudio(folder: Path) -> Layout | None:
     pairs = tuple(path for path in pictures_in(folder) if SIDE_BY_SIDE.fullmatch(path.stem))
     if not pairs:
         return None
-    return Layout(
-        program="nerfstudio", sets=(PictureSet(folder=folder, files=pairs, side_by_side=True, numbered=True),)
-    )
+    pictures = PictureSet(folder=folder, files=pairs, side_by_side=True, numbered=True)
+    return Layout(program="nerfstudio", sets=(pictures,))
 
 
 def named_renders(program: str, renders: Path, photos: Path) -> Layout | None:
     """Returns renders that have the names of photos, also below sub-folders; None: there are none."""
-    files = pictures_below(renders)
-    if not files:
-        return None
-    return Layout(
-        program=program, sets=(PictureSet(folder=renders, files=files, truths=partners(files, renders, photos)),)
-    )
+    files = pictures_in(renders, below=True)
+    pictures = PictureSet(folder=renders, files=files, truths=partners(files, renders, photos))
+    return Layout(program=program, sets=(pictures,)) if files else None
 
 
 def plain(folder: Path) -> Layout | None:
     """Recognises pictures of one zoom, or one sub-folder for each zoom; otherwise sub-folders belong to the names."""
-    zooms = [path for path in subfolders(folder) if ZOOM_FOLDER.fullmatch(path.name) and pictures_below(path)]
+    zooms = [path for path in subfolders(folder) if ZOOM_FOLDER.fullmatch(path.name) and pictures_in(path, below=True)]
     direct = pictures_in(folder)
-    sets = [PictureSet(folder=path, files=pictures_below(path)) for path in zooms]
+    sets = [PictureSet(folder=path, files=pictures_in(path, below=True)) for path in zooms]
     if direct or not zooms:
-        files = direct if zooms else pictures_below(folder)
+        files = direct if zooms else pictures_in(folder, below=True)
         sets = [PictureSet(folder=folder, files=files), *sets] if files else sets
     return Layout(program="pictures", sets=tuple(sets)) if sets else None
 
@@ -143,32 +133,21 @@ def subfolders(folder: Path) -> list[Path]:
     return [path for path in sorted(folder.iterdir()) if path.is_dir() and not path.name.startswith(".")]
 
 
-def pictures_in(folder: Path) -> tuple[Path, ...]:
-    """Returns the pictures in a folder, by name; none: it does not exist."""
-    return tuple(only_pictures(sorted(folder.iterdir()))) if folder.is_dir() else ()
-
-
-def pictures_below(folder: Path) -> tuple[Path, ...]:
-    """Returns the pictures in a folder and its visible sub-folders, by name; none: it does not exist."""
+def pictures_in(folder: Path, below: bool = False) -> tuple[Path, ...]:
+    """Returns the visible pictures in a folder, by name, with those `below` it; none: it does not exist."""
     if not folder.is_dir():
         return ()
-    return tuple(file for file in only_pictures(sorted(folder.rglob("*"))) if not is_hidden(file.relative_to(folder)))
-
-
-def is_hidden(path: Path) -> bool:
-    """Returns whether a path leads through a hidden folder, such as .ipynb_checkpoints."""
-    return any(part.startswith(".") for part in path.parts)
-
-
-def only_pictures(paths: Sequence[Path]) -> Iterator[Path]:
-    """Yields the visible picture files."""
-    for path in paths:
-        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file():
-            yield path
+    return tuple(
+        file
+        for file in sorted(folder.rglob("*") if below else folder.iterdir())
+        if file.suffix.lower() in SUFFIXES
+        and not any(part.startswith(".") for part in file.relative_to(folder).parts)  # such as .ipynb_checkpoints
+        and file.is_file()
+    )
 
 
 def partners(files: Sequence[Path], folder: Path, photos: Path) -> dict[Path, Path]:
     """Returns the photos that have the names of renders below another folder, with any suffix."""
-    known = {path.relative_to(photos).with_suffix(""): path for path in pictures_below(photos)}
+    known = {path.relative_to(photos).with_suffix(""): path for path in pictures_in(photos, below=True)}
     keys = {file: file.relative_to(folder).with_suffix("") for file in files}
     return {file: known[key] for file, key in keys.items() if key in known}

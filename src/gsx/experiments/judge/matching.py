@@ -1,20 +1,22 @@
-"""Assigns pictures to test views and zooms."""
+"""Assigns pictures to test views and zooms; does a picture show the view that its number assigns it to?"""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
+import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from gsx.core.data.camera import Camera
-from gsx.core.data.scene import View
+from gsx.core.data.scene import Scene, View
 from gsx.core.errors import InputError, nearest
 from gsx.core.shapes import Float
-from gsx.experiments.judge.counts import counted
 from gsx.experiments.judge.layouts import PictureSet
 from gsx.experiments.judge.picture_files import Header, read_header, read_picture
 from gsx.experiments.judge.view_names import order_near
+from gsx.experiments.reports.page import counted
 
 NUMBER = re.compile(r"\d+$")
 """Number at the end of a picture's name."""
@@ -99,7 +101,10 @@ class Matcher:
                 note = f"views in the order of {listed[0].name}"
                 return self.in_order(pictures, listed[1], f"in '{listed[0]}'"), [note], False
             if all(NUMBER.search(file.stem) for file in pictures.files):
-                return self.by_number(pictures)
+                if self.order is not None:
+                    return self.in_order(pictures, self.order, "in --order"), ["views in the order of --order"], False
+                note = "pictures are numbered: taken in the order of the test views"
+                return self.in_order(pictures, self.views, "held out"), [note], True
         self.refuse_missing(pictures, named)
         extra = len(pictures.files) - len(named)
         notes = [f"of no test view and left out: {counted(extra, 'picture')}"] if extra else []
@@ -112,13 +117,6 @@ class Matcher:
         if self.order is None:
             return bool(named)
         return len(named) in (len(self.views), len(pictures.files))
-
-    def by_number(self, pictures: PictureSet) -> tuple[dict[View, Path], list[str], bool]:
-        """Returns numbered pictures by view, in the order of --order or of the test views, and a remark."""
-        if self.order is not None:
-            return self.in_order(pictures, self.order, "in --order"), ["views in the order of --order"], False
-        note = "pictures are numbered: taken in the order of the test views"
-        return self.in_order(pictures, self.views, "held out"), [note], True
 
     def named(self, pictures: PictureSet) -> Iterator[tuple[View, Path]]:
         """Yields pictures that have the name of a view; InputError: two have the same."""
@@ -140,9 +138,10 @@ class Matcher:
     def in_order(self, pictures: PictureSet, views: Sequence[View], where: str) -> dict[View, Path]:
         """Returns numbered pictures by view; InputError: their number is not that of the views listed `where`."""
         if (count := len(pictures.files)) != len(views):
+            example = f"the first view is '{self.views[0].name}', the first picture {pictures.files[0].name}"
             raise InputError(
                 f"'{pictures.folder}' holds {counted(count, 'picture')}, but there are {len(views)} test views "
-                f"{where}, and the pictures do not have the names of views ({self.example(pictures)}): name them as "
+                f"{where}, and the pictures do not have the names of views ({example}): name them as "
                 "the views, or give --order FILE with the name of each picture's view, one a line"
             )
         return dict(zip(views, sorted(pictures.files, key=number_of), strict=True))
@@ -165,10 +164,6 @@ class Matcher:
         guess = nearest(name, unused)
         return f" (nearest: {guess.split(chr(39))[1]})" if guess else ""
 
-    def example(self, pictures: PictureSet) -> str:
-        """Returns a view and a picture, for an error on names."""
-        return f"the first view is '{self.views[0].name}', the first picture {pictures.files[0].name}"
-
     def sized(self, view: View, file: Path, pictures: PictureSet) -> PlacedPicture:
         """Returns a picture with the camera of its size; InputError: it is that of no zoom."""
         header = read_header(file)
@@ -179,7 +174,11 @@ class Matcher:
             camera = view.camera.zoom(factor)
             slack = max(1, factor)  # a reduced side is rounded by up to a px, at a zoom by as many
             if abs(camera.width - width) <= slack and abs(camera.height - height) <= slack:
-                self.refuse_without_truth(view, file, factor)
+                if view.zoom(factor) is None:
+                    raise InputError(
+                        f"'{file}' shows view '{view.name}' at x{factor:g}, where its photo has no pixels: use smaller "
+                        "zooms, or by a larger scene.downscale"
+                    )
                 return PlacedPicture(
                     file=file,
                     camera=view.camera.resize(width, height),
@@ -188,21 +187,12 @@ class Matcher:
                     truth=pictures.truths.get(file),
                     side_by_side=pictures.side_by_side,
                 )
-        raise InputError(f"'{file}' is {width} x {height} px, {self.sizes_of(view)}")
-
-    def refuse_without_truth(self, view: View, file: Path, factor: float) -> None:
-        """Raises InputError for a zoom at which a view has no photo."""
-        if view.zoom(factor) is None:
-            raise InputError(
-                f"'{file}' shows view '{view.name}' at x{factor:g}, where its photo has no pixels: use smaller "
-                f"zooms, or by a larger scene.downscale"
-            )
-
-    def sizes_of(self, view: View) -> str:
-        """Returns the sizes of a view, and a remedy, for an error."""
         known = {factor: view.camera.zoom(factor).size for factor in (1, 2, 4) if view.zoom(factor) is not None}
-        listed = ", ".join(f"{width} x {height} at x{factor}" for factor, (width, height) in known.items())
-        return f"and view '{view.name}' is {listed}: render one of these sizes, or choose scene.downscale to fit"
+        listed = ", ".join(f"{across} x {down} at x{factor}" for factor, (across, down) in known.items())
+        raise InputError(
+            f"'{file}' is {width} x {height} px, and view '{view.name}' is {listed}: render one of these sizes, or "
+            "choose scene.downscale to fit"
+        )
 
 
 def number_of(file: Path) -> tuple[str, int, str]:
@@ -230,3 +220,41 @@ def rounding_notes(placed: Mapping[str, PlacedPicture], views: Mapping[str, View
         f"rounded to another size: {counted(len(odd), 'picture')}, such as {own[0]} x {own[1]} px instead of "
         f"{ours[0]} x {ours[1]}; photos are reduced to that size"
     ]
+
+
+SIDE = 16
+"""Width and height of the thumbnails that are compared, px."""
+CLEARLY = 0.8
+"""A picture shows another view if its mean square there is below so much of that of its own."""
+MOST_SHARE = 0.25
+"""Largest share of pictures that may resemble another view: neighbouring views are alike, and renders are faulty."""
+
+
+def refuse_other_order(folder: Path, pictures: Mapping[str, PlacedPicture], scene: Scene) -> None:
+    """Raises InputError if many pictures, matched by their numbers, resemble another view more than their own."""
+    views = [view for view in scene.test if view.name in pictures]
+    if len(views) < 2:
+        return
+    photos = torch.stack([thumbnail(view.image()) for view in views])
+    renders = torch.stack([thumbnail(pictures[view.name].render(scene.background)) for view in views])
+    errors = (renders[:, None] - photos[None]).square().flatten(2).mean(2)
+    odd = (errors.min(1).values < CLEARLY * errors.diagonal()).nonzero()[:, 0].tolist()
+    if len(odd) > MOST_SHARE * len(views):
+        raise InputError(in_words(folder, views, pictures, odd[0], int(errors[odd[0]].argmin()), len(odd)))
+
+
+def in_words(
+    folder: Path, views: list[View], pictures: Mapping[str, PlacedPicture], number: int, other: int, count: int
+) -> str:
+    """Returns the error for pictures in another order."""
+    name = views[number].name
+    return (
+        f"'{folder}': {count} of {len(views)} numbered pictures resemble another view than that of their number, such "
+        f"as {pictures[name].file.name}, taken for '{name}' and more like '{views[other].name}': give --order FILE "
+        "with the name of each picture's view, one a line"
+    )
+
+
+def thumbnail(picture: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 side side"]:
+    """Reduces a picture to a small square by means over areas."""
+    return interpolate(picture[None], size=(SIDE, SIDE), mode="area")[0]

@@ -21,13 +21,11 @@ from gsx.experiments.evaluation.perceptual import PerceptualMetrics
 from gsx.experiments.evaluation.zoom_figures import ZoomFigures, zoom_result
 from gsx.experiments.evaluation.zoomed import Zoomed
 from gsx.experiments.judge.methods import Method, PictureFolder
-from gsx.experiments.judge.similarity_variants import all_ssim, named
+from gsx.experiments.judge.similarity_variants import all_ssim
 
 Picture: TypeAlias = Float[Tensor, "3 H W"]
 RIVALS = ("enlarged", "upscaled")
 """Pictures that a zoomed render is compared with."""
-DETAILED = ("render",)
-"""Pictures whose explained detail is measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,12 +64,8 @@ class Measured:
 
     def means(self) -> dict[str, dict[str, Any]]:
         """Returns the means over views by zoom, as in evaluation.json."""
-        return {f"{factor:g}": self.mean(factor) for factor in sorted(self.zooms)}
-
-    def mean(self, factor: float) -> dict[str, Any]:
-        """Returns the means over views at one zoom."""
-        consistency = self.cross.figures(factor) if self.cross else {}
-        return zoom_result(factor, self.zooms[factor]) | consistency
+        consistency = {factor: self.cross.figures(factor) if self.cross else {} for factor in self.zooms}
+        return {f"{zoom:g}": zoom_result(zoom, self.zooms[zoom]) | consistency[zoom] for zoom in sorted(self.zooms)}
 
 
 Receive: TypeAlias = Callable[[Method, View, Zoomed], None]
@@ -97,7 +91,7 @@ class Measurement:
         for view in self.scene.test:
             for one in self.found:
                 for factor, zoomed in self.pictures(one.method, view):
-                    one.add(view, factor, self.figures(zoomed) if factor != 1 else self.plain_figures(zoomed))
+                    one.add(view, factor, self.figures(zoomed))
                     if one.cross and factor > 1:
                         one.cross.add(view, zoomed)
                     receive(one.method, view, zoomed)
@@ -137,52 +131,36 @@ class Measurement:
         if camera is None or image is None:
             return None
         finer = replace(view, camera=camera)
-        counted, truth = finer.counted(), finer.image()
+        counted, truth, measured = finer.counted(), finer.image(), self.protocol.options.measured
+        enlarged = None if first is None else black_out(measured(bicubic(first, *camera.size)), counted)
         zoomed = Zoomed(
             view=finer,
             factor=factor,
             truth=black_out(truth, counted),
             render=black_out(image, counted),
-            enlarged=None if first is None else black_out(self.enlarged(first, finer), counted),
+            enlarged=enlarged,
             counted=self.protocol.evaluated(counted),
         )
         if self.protocol.competitor is None or first is None or camera.size != view.camera.zoom(factor).size:
             return zoomed
-        return self.protocol.competitor.join(zoomed, first, view, self.protocol.options.measured)
-
-    def enlarged(self, picture: Picture, finer: View) -> Picture:
-        """Returns a picture on the raster of a finer view, by bicubic interpolation."""
-        return self.protocol.options.measured(bicubic(picture, *finer.camera.size))
-
-    def plain_figures(self, zoomed: Zoomed) -> ZoomFigures:
-        """Measures an x1 picture, which nothing competes with."""
-        return ZoomFigures(zoomed.view.group, self.of_render(zoomed), {}, self.perceptual(zoomed, ("render",)))
+        return self.protocol.competitor.join(zoomed, first, view, measured)
 
     def figures(self, zoomed: Zoomed) -> ZoomFigures:
-        """Measures a zoomed picture and its rivals."""
-        rivals = {
-            f"{name}_psnr": psnr(picture, zoomed.truth, zoomed.counted)
-            for name, picture in zoomed.pictures(RIVALS).items()
+        """Measures a picture: PSNR, SSIM by the protocol and by each variant, LPIPS, and its rivals at other zooms."""
+        render, truth, counted = zoomed.render, zoomed.truth, zoomed.counted
+        rivals = zoomed.pictures(RIVALS if zoomed.factor != 1 else ())
+        similar, lpips = all_ssim(render, truth, counted, self.protocol.backend), self.protocol.lpips
+        figures = {
+            "psnr": psnr(render, truth, counted),
+            "ssim": similar[self.protocol.options.ssim],
+            **{f"ssim_{name}": value for name, value in similar.items()},
+            **({} if lpips is None else {"lpips": lpips.distance(render, truth)}),
+            **{f"{name}_psnr": psnr(picture, truth, counted) for name, picture in rivals.items()},
         }
-        pictures = zoomed.pictures(DETAILED) if zoomed.view.counted() is None else {}
-        return ZoomFigures(
-            zoomed.view.group,
-            self.of_render(zoomed) | rivals,
-            details_of(pictures, zoomed.truth, zoomed.factor) if pictures else {},
-            self.perceptual(zoomed, ("render", *RIVALS)),
-        )
-
-    def of_render(self, zoomed: Zoomed) -> dict[str, float]:
-        """Measures a method's picture: PSNR, SSIM by the protocol and by each variant, LPIPS."""
-        similar = all_ssim(zoomed.render, zoomed.truth, zoomed.counted, self.protocol.backend)
-        own = {"psnr": psnr(zoomed.render, zoomed.truth, zoomed.counted), "ssim": similar[self.protocol.options.ssim]}
-        lpips = self.protocol.lpips
-        distance = {} if lpips is None else {"lpips": lpips.distance(zoomed.render, zoomed.truth)}
-        return own | named(similar) | distance
-
-    def perceptual(self, zoomed: Zoomed, names: Sequence[str]) -> dict[str, dict[str, float]]:
-        """Measures pictures of a zoom by each perceptual metric."""
-        return self.protocol.perceptual.compare(zoomed.pictures(names), zoomed.truth)
+        detailed = zoomed.factor != 1 and zoomed.view.counted() is None
+        details = details_of({"render": render}, truth, zoomed.factor) if detailed else {}
+        perceptual = self.protocol.perceptual.compare({"render": render, **rivals}, truth)
+        return ZoomFigures(zoomed.view.group, figures, details, perceptual)
 
 
 def own_truth_psnr(method: Method, scene: Scene) -> dict[str, float]:
@@ -192,18 +170,16 @@ def own_truth_psnr(method: Method, scene: Scene) -> dict[str, float]:
     """
     if not isinstance(method, PictureFolder):
         return {}
-    found = {factor: list(truth_differences(method, scene.test, factor)) for factor in method.pictures}
+
+    def differences(factor: float) -> Iterator[float]:
+        for view in scene.test:
+            if placed := method.pictures[factor].get(view.name):
+                photo, truth = placed.photo(scene.background), replace(view, camera=placed.camera)
+                if photo is not None and photo.shape == truth.image().shape:
+                    yield psnr(photo, truth.image(), truth.counted())
+
+    found = {factor: list(differences(factor)) for factor in method.pictures}
     return {f"{factor:g}": statistics.fmean(values) for factor, values in found.items() if values}
-
-
-def truth_differences(method: PictureFolder, views: Sequence[View], factor: float) -> Iterator[float]:
-    """Yields the PSNR of each photo of a program against the protocol's, dB."""
-    for view in views:
-        photo, camera = method.truth_of_program(view, factor), method.camera(view, factor)
-        if photo is not None and camera is not None:
-            truth = replace(view, camera=camera)
-            if photo.shape == truth.image().shape:
-                yield psnr(photo, truth.image(), truth.counted())
 
 
 def by_view(found: Mapping[str, Any], zoom: str, figure: str) -> dict[str, float]:

@@ -17,10 +17,9 @@ from gsx.experiments.evaluation.eval_options import EvalOptions
 from gsx.experiments.evaluation.evaluated_renders import EvaluatedRenders
 from gsx.experiments.evaluation.warp import Surface
 from gsx.experiments.evaluation.zoomed import Zoomed
-from gsx.experiments.judge.counts import counted
 from gsx.experiments.judge.layouts import layout_of
-from gsx.experiments.judge.matching import Matcher, Placed, PlacedPicture
-from gsx.experiments.judge.resemblance import refuse_other_order
+from gsx.experiments.judge.matching import Matcher, Placed, PlacedPicture, refuse_other_order
+from gsx.experiments.reports.page import counted
 from gsx.scenes.origin import relative_camera
 
 
@@ -110,11 +109,6 @@ class PictureFolder:
         placed = self.placed(view, factor)
         assert placed is not None, "`camera` says which pictures there are"
         return placed.render(self.background)
-
-    def truth_of_program(self, view: View, factor: float) -> Float[Tensor, "3 H W"] | None:
-        """Reads the photo that the program compared with; None: it wrote none."""
-        placed = self.placed(view, factor)
-        return placed.photo(self.background) if placed else None
 
     def facts(self) -> dict[str, Any]:
         """Returns the program whose layout the folder has, and the number of pictures by zoom."""

@@ -13,17 +13,16 @@ from gsx.core.errors import ConfigError, InputError
 from gsx.core.plugins import Plugins
 from gsx.core.training.regenerator import RegeneratorContext
 from gsx.experiments.evaluation.competitor import Competitor, competitor_for, refuse_learning
-from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.eval_options import protocol_of
 from gsx.experiments.evaluation.lpips import load_lpips
 from gsx.experiments.evaluation.perceptual import MetricSettings, load_metrics
-from gsx.experiments.evaluation.protocol import protocol_of
-from gsx.experiments.judge.counts import counted
 from gsx.experiments.judge.crops import Crops
 from gsx.experiments.judge.matching import Matcher
 from gsx.experiments.judge.measure import Measured, Measurement, Protocol, own_truth_psnr
 from gsx.experiments.judge.methods import Entry, Method, Model, PictureFolder
 from gsx.experiments.judge.models import is_model, opened_model
 from gsx.experiments.judge.view_names import bare, names_of_views, read_order
+from gsx.experiments.reports.page import counted
 from gsx.experiments.runs.build import choose_device, prepare_process
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.load_scene import load_scene, with_small_cache
@@ -74,10 +73,15 @@ def measure_scene(
         ConfigError, InputError: a setting, the scene or a method cannot be measured.
     """
     settings = with_small_cache(compose(subject.overrides, plugins))
-    refuse_halves(settings.evaluation)
+    if settings.evaluation.right_halves:
+        raise ConfigError(
+            f"gsx judge compares pictures as they are: leave out eval.colours={settings.evaluation.colours} eval.poses="
+            f"{settings.evaluation.poses}, which `gsx eval` has"
+        )
     prepare_process(choose_device(settings.general.device), training=False)
     scene = load_scene(settings)
-    refuse_without_test_views(scene)
+    if not scene.test:
+        raise ConfigError("gsx judge compares with test views: choose another split than scene.split=none")
     refuse_other_views(subject, scene)
     methods = methods_of(subject, entries, choices, settings, plugins, scene)
     zooms = zooms_of(subject, methods, settings.evaluation.zoom)
@@ -100,21 +104,6 @@ def measure_scene(
         "methods": [result_of(one, scene) for one in found],
         "pictures": crops.index(),
     }
-
-
-def refuse_halves(options: EvalOptions) -> None:
-    """Raises ConfigError for settings that need a model."""
-    if options.right_halves:
-        raise ConfigError(
-            f"gsx judge compares pictures as they are: leave out eval.colours={options.colours} eval.poses="
-            f"{options.poses}, which `gsx eval` has"
-        )
-
-
-def refuse_without_test_views(scene: Scene) -> None:
-    """Raises ConfigError if no view is held out."""
-    if not scene.test:
-        raise ConfigError("gsx judge compares with test views: choose another split than scene.split=none")
 
 
 def refuse_other_views(subject: Subject, scene: Scene) -> None:
@@ -143,8 +132,15 @@ def methods_of(
     def model(entry: Entry) -> Model:
         return opened_model(entry, subject.overrides, settings, plugins, scene)
 
-    depth = model(Entry(name="--depth", path=model_at(choices.depth))) if choices.depth else None
-    matcher = matcher_for(scene, settings.evaluation, subject, choices)
+    if choices.depth and not is_model(choices.depth):
+        raise InputError(
+            f"--depth {choices.depth} is neither a run folder nor a splat file ({READABLE}): give one of these"
+        )
+    depth = model(Entry(name="--depth", path=choices.depth)) if choices.depth else None
+    names = names_of_views(scene.test, {view: bare(file) for view, file in (subject.aliases or {}).items()})
+    order = None if choices.order is None else ordered_views(choices.order, names)
+    zooms = [*settings.evaluation.zoom, *subject.prepared_zooms]
+    matcher = Matcher(scene.test, names, zooms, order, choices.partial)
 
     def method(entry: Entry) -> Method:
         return model(entry) if is_model(entry.path) else PictureFolder(entry, scene, matcher, depth)
@@ -160,21 +156,6 @@ def place_for(path: Path, scene: str) -> Path:
     if not place.is_dir() and not is_model(place):
         raise InputError(f"'{place}' is no splat file ({READABLE}): give a folder of pictures, or a run folder")
     return place
-
-
-def model_at(path: Path) -> Path:
-    """Returns the path of --depth; InputError: it is no run and no splat file."""
-    if not is_model(path):
-        raise InputError(f"--depth {path} is neither a run folder nor a splat file ({READABLE}): give one of these")
-    return path
-
-
-def matcher_for(scene: Scene, options: EvalOptions, subject: Subject, choices: Choices) -> Matcher:
-    """Returns what finds views and zooms of pictures."""
-    aliases = {view: bare(file) for view, file in (subject.aliases or {}).items()}
-    names = names_of_views(scene.test, aliases)
-    order = None if choices.order is None else ordered_views(choices.order, names)
-    return Matcher(scene.test, names, [*options.zoom, *subject.prepared_zooms], order, choices.partial)
 
 
 def ordered_views(path: Path, names: Mapping[str, View]) -> list[View]:
@@ -211,7 +192,10 @@ def refuse_unmeasurable(methods: Sequence[Method], zooms: Sequence[float], scene
 def with_shared_views(scene: Scene, methods: Sequence[Method], zooms: Sequence[float]) -> Scene:
     """Returns the scene with the test views that all methods have, at each zoom that they have; InputError: none."""
 
-    lacking = {method: [view for view in scene.test if lacks(method, view, zooms)] for method in methods}
+    def lacks(method: Method, view: View) -> bool:
+        return any(method.camera(view, factor) is None for factor in set(method.factors() or zooms) & set(zooms))
+
+    lacking = {method: [view for view in scene.test if lacks(method, view)] for method in methods}
     for method, views in lacking.items():
         if views:
             method.notes.append(f"has no pictures of {counted(len(views), 'test view')}, such as '{views[0].name}'")
@@ -221,11 +205,6 @@ def with_shared_views(scene: Scene, methods: Sequence[Method], zooms: Sequence[f
     if len(views) < len(scene.test):
         logger.warning("%d of %d test views have pictures of all methods and are measured", len(views), len(scene.test))
     return replace(scene, test=views)
-
-
-def lacks(method: Method, view: View, zooms: Sequence[float]) -> bool:
-    """Returns whether a method lacks a picture of a view at a zoom at which it has others."""
-    return any(method.camera(view, factor) is None for factor in set(method.factors() or zooms) & set(zooms))
 
 
 def log_notes(method: Method, zooms: Sequence[float], scene: Scene) -> None:
@@ -283,19 +262,15 @@ def competitor_on(settings: Settings, scene: Scene, zooms: Sequence[float], fold
 
 def result_of(measured: Measured, scene: Scene) -> dict[str, Any]:
     """Returns the results of one method."""
-    entry, zooms = measured.method.entry, measured.means()
+    entry, zooms, notes = measured.method.entry, measured.means(), list(measured.method.notes)
+    if zooms and min(figures["psnr"] for figures in zooms.values()) == math.inf:
+        notes.append("these are the photos themselves: all pixels are equal")
     return {
         "name": entry.name,
         "repetition": entry.repetition,
         "path": str(entry.path),
         **measured.method.facts(),
-        "notes": [*measured.method.notes, *note_on_photos(zooms)],
+        "notes": notes,
         "zoom": zooms,
         "views": measured.views,
     }
-
-
-def note_on_photos(zooms: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Returns a note if the pictures of a method are the photos themselves, by its figures at each zoom."""
-    levels = [figures["psnr"] for figures in zooms.values()]
-    return ["these are the photos themselves: all pixels are equal"] if levels and min(levels) == math.inf else []

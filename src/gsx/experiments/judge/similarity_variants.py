@@ -1,7 +1,5 @@
 """SSIM with each treatment of borders, from one pass over the picture's interior."""
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -87,8 +85,3 @@ def borders() -> list[tuple[slice, slice, tuple[slice, slice]]]:
 def weighted_sum(found: Float[Tensor, "C h w"], weights: Float[Tensor, "h w"]) -> float:
     """Sums a map over channels and pixels by weight, in float64."""
     return float((found.cpu().sum(0, dtype=torch.float64) * weights).sum())
-
-
-def named(found: Mapping[str, float]) -> dict[str, float]:
-    """Returns the figures under their keys of the results."""
-    return {f"ssim_{name}": value for name, value in found.items()}

@@ -44,17 +44,12 @@ def repetitions(result: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]
     return [method for method in result["methods"] if method["name"] == name]
 
 
-def zooms_in(result: Mapping[str, Any]) -> list[str]:
-    """Returns the zooms that any method has, from far to near."""
-    return sorted({zoom for method in result["methods"] for zoom in method["zoom"]}, key=float)
-
-
 def rows_of(results: Results, baseline: str) -> list[Row]:
     """Returns a row for each scene, protocol, zoom and method: figures, and the PSNR difference from the baseline."""
     return [
         row_of(result, zoom, name, baseline)
         for result in results
-        for zoom in zooms_in(result)
+        for zoom in sorted({zoom for method in result["methods"] for zoom in method["zoom"]}, key=float)
         for name in named_methods([result])
         if any(zoom in method["zoom"] for method in repetitions(result, name))
     ]

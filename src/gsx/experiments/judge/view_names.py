@@ -32,18 +32,13 @@ def names_of_views(views: Sequence[View], aliases: Mapping[str, str]) -> dict[st
     A view `cam1/0001.jpg` is called cam1/0001, cam1_0001 or 0001. aliases: further names by name of the view.
     """
     drawn = file_names([view.name for view in views])
-    names = [
-        spellings(view.name) | {file, aliases.get(view.name, file)} for view, file in zip(views, drawn, strict=True)
-    ]
+    names = []
+    for view, file in zip(views, drawn, strict=True):
+        plain = bare(view.name)
+        names.append({plain, plain.replace("/", "_"), PurePosixPath(plain).name, file, aliases.get(view.name, file)})
     shared = {name for name, count in Counter(name for own in names for name in own).items() if count > 1}
     whole = {bare(view.name): view for view in views}
     return {name: view for view, own in zip(views, names, strict=True) for name in own - shared} | whole
-
-
-def spellings(name: str) -> set[str]:
-    """Returns the names of a picture of one view."""
-    whole = bare(name)
-    return {whole, whole.replace("/", "_"), PurePosixPath(whole).name}
 
 
 def order_near(folder: Path, names: Mapping[str, View]) -> tuple[Path, list[View]] | None:

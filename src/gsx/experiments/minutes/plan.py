@@ -7,8 +7,15 @@ from typing import Any
 
 from gsx.core.errors import ConfigError
 from gsx.core.options import flattened
-from gsx.experiments.minutes.cost import Growth, Measurement, StepCost, planned_seconds, stages_of, step_cost
-from gsx.experiments.minutes.options import CostOptions, PlanOptions
+from gsx.experiments.minutes.cost import (
+    CostOptions,
+    Growth,
+    Measurement,
+    PlanOptions,
+    planned_seconds,
+    stages_of,
+    step_cost,
+)
 from gsx.experiments.runs.settings import Settings
 
 SIZE, WIDTH = "scene.downscale", "scene.max_width"
@@ -45,6 +52,11 @@ class Task:
     def values(self) -> dict[str, Any]:
         """Values of the settings by dotted key, with those of planned runs."""
         return flattened(self.settings.resolved) | schedule_of(self.settings, self.fixed, self.options)
+
+    @property
+    def cost(self) -> CostOptions:
+        """Cost model of the measured device."""
+        return self.options.cost.of(self.measurement.device)
 
 
 def schedule_of(settings: Settings, fixed: frozenset[str], options: PlanOptions) -> dict[str, Any]:
@@ -178,17 +190,8 @@ def training_seconds(task: Task, downscale: int, steps: int) -> list[float]:
     coarse = values.get("training.coarse_to_fine.factor", 1), values.get("training.coarse_to_fine.until", 0.0)
     fine = values.get("training.supersampling.factor", 1), values.get(FINE_FROM, 0.0)
     growth, pixels = growth_of(task, downscale, steps), pixels_at(task, downscale)
-    return planned_seconds(cost_of(task), stages_of(*coarse, *fine), growth, pixels, steps)
-
-
-def cost_options(task: Task) -> CostOptions:
-    """Returns the cost model of the measured device."""
-    return task.options.cost.of(task.measurement.device)
-
-
-def cost_of(task: Task) -> StepCost:
-    """Returns the cost of a step of the task's backbone."""
-    return step_cost(task.measurement, cost_options(task), task.settings.backbone.component.name)
+    cost = step_cost(task.measurement, task.cost, task.settings.backbone.component.name)
+    return planned_seconds(cost, stages_of(*coarse, *fine), growth, pixels, steps)
 
 
 def growth_of(task: Task, downscale: int, steps: int) -> Growth:
@@ -229,7 +232,7 @@ def events_of(task: Task, steps: int) -> float:
 
 def rows_of(task: Task) -> float:
     """Returns the primitives that a row of the backbone's table costs."""
-    return cost_options(task).rows.get(task.settings.backbone.component.name, 1.0)
+    return task.cost.rows.get(task.settings.backbone.component.name, 1.0)
 
 
 def growth_window(task: Task) -> tuple[float, float]:
@@ -253,7 +256,8 @@ def changes_of(task: Task, plan: Plan) -> Mapping[str, Any]:
     if with_stereo(task):
         changes[STEREO] = stereo_points(task, plan.primitives)
     if PASSES in values and PASSES not in fixed:
-        changes[PASSES] = passes_of(task, plan)
+        start, stop = growth_window(task)
+        changes[PASSES] = min(1.0, round(plan.steps * (stop - start) / (task.options.events * task.views), 2))
     return changes | deadline_of(values, plan)
 
 
@@ -262,12 +266,6 @@ def capacity_of(values: Mapping[str, Any], fixed: frozenset[str], primitives: in
     if values.get(CAPACITY) != "published" or CAPACITY in fixed:
         return {}
     return {CAPACITY: "budget", BUDGET: min(primitives, values.get(MOST) or primitives)}
-
-
-def passes_of(task: Task, plan: Plan) -> float:
-    """Returns the passes over the training views between events of density control, at most one."""
-    start, stop = growth_window(task)
-    return min(1.0, round(plan.steps * (stop - start) / (task.options.events * task.views), 2))
 
 
 def deadline_of(values: Mapping[str, Any], plan: Plan) -> dict[str, Any]:

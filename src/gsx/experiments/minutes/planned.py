@@ -11,8 +11,7 @@ from gsx.core.errors import ConfigError, command
 from gsx.core.options import flattened
 from gsx.core.plugins import Plugins
 from gsx.engine.processes import processes
-from gsx.experiments.minutes.options import PlanOptions, plan_options
-from gsx.experiments.minutes.overriding import overridden
+from gsx.experiments.minutes.cost import PlanOptions, plan_options
 from gsx.experiments.minutes.plan import (
     SIZE,
     WIDTH,
@@ -30,7 +29,7 @@ from gsx.experiments.runs.build import choose_device
 from gsx.experiments.runs.early_compiling import compiling_before
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.experiments.runs.open import refuse_early
-from gsx.experiments.runs.settings import Settings
+from gsx.experiments.runs.settings import Settings, overridden
 
 logger = logging.getLogger(__name__)
 
@@ -63,12 +62,8 @@ def untimed_because(words: Sequence[str]) -> str:
     if keys_of(words) & {*TIMES, *LENGTHS} or not on_cpu(words):
         return ""
     several = [word for word in words if word in ("-m", "--multirun")]
-    return " ".join([*several, *(word for word in words if keys_of([word]) & {*OWN_LENGTH}), *torchrun()])
-
-
-def torchrun() -> list[str]:
-    """Returns the word for several processes, if there are."""
-    return ["torchrun"] if processes() > 1 else []
+    torchrun = ["torchrun"] if processes() > 1 else []
+    return " ".join([*several, *(word for word in words if keys_of([word]) & {*OWN_LENGTH}), *torchrun])
 
 
 def log_untimed(because: str, length: str) -> None:
@@ -106,7 +101,13 @@ def planned(settings: Settings, words: Sequence[str], loaded: Plugins, started: 
         return settings
     started, fixed, options = time.monotonic() if started is None else started, keys_of(words), plan_options()
     refuse(settings, fixed)
-    refuse_no_time(settings, limit, time.monotonic() - started, options)
+    if limit - (used := time.monotonic() - started) <= options.report:
+        unit, name = (60, "minutes") if settings.general.minutes else (1, "seconds")
+        least = 60 // unit * math.ceil((used + options.report) / 60)
+        raise ConfigError(
+            f"{name}={limit / unit:g} leaves nothing after start-up ({used:.0f} s here) and report: give at least "
+            f"{name}={least}"
+        )
     refuse_early(settings)
     changes = schedule_of(settings, fixed, options) | capacity_of(flattened(settings.resolved), fixed, MANY)
     with compiling_before(overridden(settings, changes | {"iterations": LENGTH}, loaded)):
@@ -114,7 +115,9 @@ def planned(settings: Settings, words: Sequence[str], loaded: Plugins, started: 
     plan = plan_run(task)
     changes = {"minutes": 0.0, "seconds": 0.0, **changes_of(task, plan)}
     again = [word for word in words if word.partition("=")[0] not in (*TIMES, "folder")]
-    again += [f"{key}={text_of(value)}" for key, value in changes.items() if key not in TIMES and not of_clock(key)]
+    for key, value in changes.items():
+        if key not in TIMES and not key.startswith("training.deadline."):  # which the repeated run does not need
+            again.append(f"{key}={value:g}" if isinstance(value, float) else f"{key}={value}")
     announce(task, plan, limit, time.monotonic() - started, again)
     facts = facts_of(task, plan, limit, time.monotonic() - started)
     return replace(overridden(settings, changes, loaded), repeat=tuple(again), time_plan=facts)
@@ -139,11 +142,6 @@ def refuse_resumed(words: Iterable[str]) -> None:
         raise ConfigError(f"gsx resume: {both[0]} plans new runs only; give iterations=N to train longer")
 
 
-def of_clock(key: str) -> bool:
-    """Returns whether a key belongs to the deadline, which the repeated run does not need."""
-    return key.startswith("training.deadline.")
-
-
 def refuse(settings: Settings, fixed: frozenset[str]) -> None:
     """Raises ConfigError for words that minutes=N cannot be combined with."""
     name = "minutes" if settings.general.minutes else "seconds"
@@ -158,18 +156,6 @@ def refuse(settings: Settings, fixed: frozenset[str]) -> None:
         raise ConfigError(f"{name}=N plans models that begin with the scene: give iterations=N with init=FILE")
     if processes() > 1:
         raise ConfigError(f"{name}=N plans for one process: call gsx without torchrun, or give iterations=N")
-
-
-def refuse_no_time(settings: Settings, limit: float, used: float, options: PlanOptions) -> None:
-    """Raises ConfigError if nothing of the time is left for training after `used` seconds and the report."""
-    if limit - used > options.report:
-        return
-    name, value = ("minutes", limit / 60) if settings.general.minutes else ("seconds", limit)
-    least = math.ceil((used + options.report) / 60)
-    raise ConfigError(
-        f"{name}={value:g} leaves nothing after start-up ({used:.0f} s here) and report: give at least "
-        f"{name}={least if name == 'minutes' else 60 * least}"
-    )
 
 
 def task_of(
@@ -231,8 +217,3 @@ def announce(task: Task, plan: Plan, limit: float, used: float, again: Sequence[
 def in_words(seconds: float) -> str:
     """Formats seconds as minutes, short times as seconds."""
     return f"{seconds:.0f} seconds" if seconds < 100 else f"{seconds / 60:.1f} minutes"
-
-
-def text_of(value: object) -> str:
-    """Returns a planned value as text of the command line."""
-    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,10 +1,8 @@
 """Short measurement before a plan: steps at two sizes, photos, and the evaluation of one view."""
 
-import logging
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,25 +11,21 @@ from typing import Any
 
 from gsx.core.data.scene import Scene, View
 from gsx.core.device import clock
-from gsx.core.errors import CompilerError
 from gsx.core.plugins import Plugins, load_plugins
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import train_step
 from gsx.experiments.evaluation.chosen_views import evenly
 from gsx.experiments.evaluation.evaluator import Evaluator
-from gsx.experiments.minutes.cost import MILLION, Measurement
-from gsx.experiments.minutes.options import ProbeOptions
-from gsx.experiments.minutes.overriding import overridden
+from gsx.experiments.minutes.cost import MILLION, Measurement, ProbeOptions
 from gsx.experiments.reports.pictures import Pictures
 from gsx.experiments.runs.build import build
 from gsx.experiments.runs.evaluate import competitor_of
 from gsx.experiments.runs.load_scene import load_scene
-from gsx.experiments.runs.rasterizer_path import warm
-from gsx.experiments.runs.settings import Settings
+from gsx.experiments.runs.logs import quiet
+from gsx.experiments.runs.rasterizer_path import warm_or_eager
+from gsx.experiments.runs.settings import Settings, overridden
 from gsx.scenes.stereo import SOURCES, depth_map, reduced
-
-logger = logging.getLogger(__name__)
 
 LENGTH = 30_000
 """Steps of the run that is measured: its schedules change nothing within the first steps."""
@@ -41,17 +35,6 @@ SAMPLES = 3
 """Test views that are timed."""
 LEAST = 0.1
 """Least share of a step's time that pixels are taken to cost: noise may hide their cost."""
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Holds back messages of runs that are only measured."""
-    before = logging.root.manager.disable
-    logging.disable(max(before, logging.INFO))
-    try:
-        yield
-    finally:
-        logging.disable(before)
 
 
 def measure(
@@ -65,15 +48,24 @@ def measure(
         options: Extent of the measurement.
         loaded: Plugins.
     """
-    short = replace(overridden(settings, dict(changes) | probe_changes(options), loaded), augmenters={})
+    until = (options.warm + options.steps) / LENGTH  # coarse views first, then the photos' size
+    coarse = {"training.coarse_to_fine.factor": COARSE, "training.coarse_to_fine.until": until}
+    probed = {"iterations": LENGTH, "training.supersampling.factor": 1, **coarse}
+    short = replace(overridden(settings, dict(changes) | probed, loaded), augmenters={})
     scene = load_scene(short)
     with quiet():
         run = build(short, replace(scene, train=evenly(scene.train, options.steps)), Path(), training=True)
-    warm_or_eager(run, settings)
+    warm_or_eager(run, settings.raster.path)
     photo = median_seconds(run, run.photos.of, run.scene.train)
     for view in run.views.at(1):
         run.photos.of(view)
-    small, large = (median_step(run, options) for _ in range(COARSE))
+    silent = load_plugins([], points=[])
+
+    def median_step() -> float:
+        times = [seconds_of(run, partial(train_step, run, silent)) for _ in range(options.warm + options.steps)]
+        return statistics.median(times[options.warm :])
+
+    small, large = median_step(), median_step()
     pixels = statistics.fmean(view.camera.width * view.camera.height for view in scene.train)
     megapixel = max(large - small, LEAST * large) / (pixels * (1 - COARSE**-2)) * MILLION
     drawn = getattr(short.scene.options, "random_points", 0) == len(scene.points)
@@ -104,36 +96,11 @@ def stereo_seconds(scene: Scene) -> float:
     return time.perf_counter() - start
 
 
-def probe_changes(options: ProbeOptions) -> dict[str, Any]:
-    """Returns the options of the measured run by dotted key: coarse views first, then the photos' size."""
-    until = (options.warm + options.steps) / LENGTH
-    coarse = {"training.coarse_to_fine.factor": COARSE, "training.coarse_to_fine.until": until}
-    return {"iterations": LENGTH, "training.supersampling.factor": 1, **coarse}
-
-
-def warm_or_eager(run: Run, settings: Settings) -> None:
-    """Compiles what steps need; a run that leaves the path to gsx is eager if that fails."""
-    try:
-        warm(run)
-    except CompilerError as error:
-        if settings.raster.path != "auto":
-            raise
-        logger.warning("%s; using the eager path, which is several times slower", error)
-        run.raster = run.backbone.raster = replace(run.raster, path="eager")
-
-
 def seconds_of(run: Run, use: Callable[[], object]) -> float:
     """Returns the seconds of a call until the run's device is idle."""
     start = clock(run.device)
     use()
     return clock(run.device) - start
-
-
-def median_step(run: Run, options: ProbeOptions) -> float:
-    """Returns the median seconds of some steps, after those that warm up."""
-    silent = load_plugins([], points=[])
-    times = [seconds_of(run, partial(train_step, run, silent)) for _ in range(options.warm + options.steps)]
-    return statistics.median(times[options.warm :])
 
 
 def median_seconds(run: Run, use: Callable[[View], object], views: Sequence[View]) -> float:

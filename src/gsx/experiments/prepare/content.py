@@ -1,11 +1,12 @@
-"""Content of a prepared folder: views, their file names, and test views at each zoom."""
+"""Content of a prepared folder: views, their file names, and test views at each zoom; what programs ignore of it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from gsx.core.data.scene import Scene, View
 from gsx.experiments.prepare.picture_names import Picture, pictures_of
 from gsx.experiments.prepare.zoom_cameras import Zoomed, zoomed_views
+from gsx.formats.origin import in_words
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -55,3 +56,28 @@ def content_of(scene: Scene, zooms: Sequence[float], with_test: bool, with_truth
         with_test=with_test and bool(test),
         with_truth=with_truth and bool(test),
     )
+
+
+CENTRE = 0.01
+"""Distance of a principal point from the centre that no program shows in its pictures, px."""
+
+
+def doubts_about(content: Prepared) -> Iterator[str]:
+    """Yield one sentence for each."""
+    cameras = [picture.camera for picture in [*content.train, *content.test]]
+    off = max(max(abs(one.cx - one.width / 2), abs(one.cy - one.height / 2)) for one in cameras)
+    if off > CENTRE:
+        yield (
+            f"principal points are up to {off:.2f} px off the centre: 3D-GS and OpenSplat ignore that, gsplat and "
+            "nerfstudio do not; scene.principal_point=centred is the same for all programs"
+        )
+    if any(content.scene.origin):
+        yield (
+            f"the scene lies around {in_words(content.scene.origin)}, where single precision is too coarse: 3D-GS and "
+            "OpenSplat lose detail there, and OpenSplat cannot read the doubles in points.ply"
+        )
+    if content.masked:
+        yield "masks lie in masks/ and transforms.json: nerfstudio uses them, 3D-GS and OpenSplat do not"
+    for factor, views in content.zoomed.items():
+        if len(views) < len(content.test):
+            yield f"zoom {factor:g} has {len(views)} of {len(content.test)} test views: the other photos are too small"

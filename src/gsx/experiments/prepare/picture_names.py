@@ -54,25 +54,16 @@ def file_names(names: Sequence[str], keep_order: bool = False) -> list[str]:
     Suffixes of photos are cut, and other characters than A-Z, a-z, 0-9, `_` and `-` become `_`. If two are then the
     same (in any case), or if the order must stay and would not, all of them begin with their number in that order.
     """
-    files = [f"{stem_of(name)}{SUFFIX}" for name in names]
+    suffixed = [PurePosixPath(name).suffix.lower() in SUFFIXES for name in names]
+    stems = [str(PurePosixPath(n).with_suffix("")) if cut else n for n, cut in zip(names, suffixed, strict=True)]
+    files = [f"{UNSAFE.sub('_', stem)[-LONGEST:]}{SUFFIX}" for stem in stems]
     order = sorted(range(len(names)), key=lambda i: sort_key(names[i]))
-    if len({file.lower() for file in files}) == len(files) and not (keep_order and by_name(files) != order):
+    sorts = not keep_order or sorted(range(len(files)), key=files.__getitem__) == order
+    if sorts and len({file.lower() for file in files}) == len(files):
         return files
     digits = len(str(len(names)))
     place = {index: number for number, index in enumerate(order, start=1)}
     return [f"{place[index]:0{digits}d}_{file}" for index, file in enumerate(files)]
-
-
-def stem_of(name: str) -> str:
-    """Return the name of a view as a file name without suffix."""
-    path = PurePosixPath(name)
-    whole = str(path.with_suffix("")) if path.suffix.lower() in SUFFIXES else name
-    return UNSAFE.sub("_", whole)[-LONGEST:]
-
-
-def by_name(files: Sequence[str]) -> list[int]:
-    """Return the positions of file names in their sorted order."""
-    return sorted(range(len(files)), key=lambda i: files[i])
 
 
 def every_eighth_is_test(train: Sequence[Picture], test: Sequence[Picture]) -> bool:

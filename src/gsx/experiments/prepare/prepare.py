@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +16,20 @@ from gsx.core.errors import ConfigError
 from gsx.core.files import finite, replace_text, write_json
 from gsx.core.plugins import Plugins
 from gsx.core.shapes import UInt8
-from gsx.experiments.evaluation.eval_options import EvalOptions
+from gsx.experiments.evaluation.eval_options import EvalOptions, protocol_of
 from gsx.experiments.evaluation.lpips import load_lpips
-from gsx.experiments.evaluation.protocol import protocol_of
 from gsx.experiments.prepare.colmap_files import write_model
-from gsx.experiments.prepare.content import Prepared, content_of, cost_of
-from gsx.experiments.prepare.doubts import doubts_about
+from gsx.experiments.prepare.content import Prepared, content_of, cost_of, doubts_about
 from gsx.experiments.prepare.picture_names import every_eighth_is_test
 from gsx.experiments.prepare.readme import readme_of
-from gsx.experiments.prepare.repeated import repeating_words
 from gsx.experiments.prepare.transforms_file import write_transforms
 from gsx.experiments.prepare.whole_folder import MANIFEST, is_prepared, refuse_inside, refuse_occupied, whole_folder
 from gsx.experiments.prepare.zoom_cameras import Zoomed, write_zoom, zoom_name
-from gsx.experiments.runs.compose import compose
+from gsx.experiments.runs.compose import Compositions, compose
 from gsx.experiments.runs.load_scene import load_scene, with_small_cache
+from gsx.experiments.runs.overrides import word_of
 from gsx.experiments.runs.progress import Countdown
+from gsx.experiments.runs.settings import Settings, settings_from
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +83,11 @@ def prepare(
 
 def manifest_of(content: Prepared, options: EvalOptions, words: Sequence[str]) -> dict[str, Any]:
     """Return the content of prepared.json; `words`: overrides that load the same scene and evaluation."""
-    scene, lpips = content.scene, load_lpips(options.lpips)
+    scene, lpips, zoomed = content.scene, load_lpips(options.lpips), content.zoomed.items()
+    test: list[dict[str, Any]] = [{"name": picture.name, "file": picture.file} for picture in content.test]
+    for one in test:
+        finer = {zoom: views[one["file"]] for zoom, views in zoomed if one["file"] in views}
+        one["sizes"] = {f"{zoom:g}": list(view.camera.size) for zoom, view in finer.items()}
     return {
         "format": FORMAT,
         "gsx": __version__,
@@ -100,13 +103,8 @@ def manifest_of(content: Prepared, options: EvalOptions, words: Sequence[str]) -
         "masks": content.masked,
         "protocol": protocol_of(scene, options, lpips.name if lpips else "n/a (no weights)"),
         "train": [{"name": picture.name, "file": f"images/{picture.file}"} for picture in content.train],
-        "test": [{"name": p.name, "file": p.file, "sizes": sizes_of(p.file, content.zoomed)} for p in content.test],
+        "test": test,
     }
-
-
-def sizes_of(file: str, zoomed: dict[float, Zoomed]) -> dict[str, list[int]]:
-    """Return width and height of a test view by zoom, px."""
-    return {f"{factor:g}": list(views[file].camera.size) for factor, views in zoomed.items() if file in views}
 
 
 def write_folder(folder: Path, content: Prepared, manifest: dict[str, Any], advance: Advance) -> None:
@@ -153,3 +151,28 @@ def write_truth(folder: Path, factor: float, views: Zoomed, advance: Advance) ->
     for file, view in views.items():
         write_image(folder / file, view.picture())
         advance(cost_of(view, factor), f"{file} {zoom_name(factor)}")
+
+
+KEPT = ("scene", "eval", "metrics")
+"""Groups that decide photos and figures."""
+
+
+def repeating_words(settings: Settings, plugins: Plugins) -> list[str]:
+    """Return overrides with the scene's format, and all values of scene and evaluation that are no defaults."""
+    scene = f"scene={settings.scene.component.name}"
+    with Compositions(plugins) as compositions:
+        defaults = settings_from(compositions.composed([scene]), plugins).resolved
+    groups = {group: differing(settings.resolved[group], defaults[group], group) for group in KEPT}
+    seed = [f"seed={settings.general.seed}"] if settings.general.seed != defaults["seed"] else []
+    return [scene, *(word for words in groups.values() for word in words), *seed]
+
+
+def differing(values: Mapping[str, Any], defaults: Mapping[str, Any], place: str) -> Iterator[str]:
+    """Yield an override by Hydra's grammar for each value below a dotted key that is not the default."""
+    for key, value in values.items():
+        default = defaults.get(key)
+        if isinstance(value, Mapping) and isinstance(default, Mapping):
+            yield from differing(value, default, f"{place}.{key}")
+        elif value != default:
+            whole = f"{place}.{key}"
+            yield word_of(whole, value) if isinstance(value, str) else f"{whole}={json.dumps(value)}"

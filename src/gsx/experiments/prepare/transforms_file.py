@@ -1,6 +1,6 @@
 """transforms.json and points.ply as nerfstudio and OpenSplat read them (nerfstudio_dataparser.py, nerfstudio.cpp)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +32,14 @@ def write_transforms(
     pictures: all in the folder; test: those of them that are held out, with lists of names by split.
     masked: each has a mask in `masks/`.
     """
-    frames = [frame_of(picture, origin, masked) for picture in pictures]
-    shared = shared_values([intrinsics(picture.camera) for picture in pictures])
-    for picture, frame in zip(pictures, frames, strict=True):
-        frame.update({} if shared else intrinsics(picture.camera))
+    each = [intrinsics(picture.camera) for picture in pictures]
+    shared = each[0] if all(one == each[0] for one in each) else {}
+    frames = []
+    for picture, own in zip(pictures, each, strict=True):
+        matrix = np.linalg.inv(camera_from_world(picture.camera, origin)) @ OPENGL  # world from camera
+        frame: dict[str, Any] = {"file_path": f"images/{picture.file}"}
+        frame |= {"mask_path": f"masks/{picture.file}"} if masked else {}
+        frames.append(frame | {"transform_matrix": matrix.tolist()} | ({} if shared else own))
     content = {
         "camera_model": "PINHOLE",
         **shared,
@@ -46,13 +50,6 @@ def write_transforms(
     }
     write_json(folder / FILE, content)
     write_points(folder / POINTS, points, origin)
-
-
-def frame_of(picture: Picture, origin: Sequence[float], masked: bool) -> dict[str, Any]:
-    """Return a frame without intrinsics; its matrix is world from camera, with OpenGL's axes."""
-    mask = {"mask_path": f"masks/{picture.file}"} if masked else {}
-    matrix = np.linalg.inv(camera_from_world(picture.camera, origin)) @ OPENGL
-    return {"file_path": f"images/{picture.file}", **mask, "transform_matrix": matrix.tolist()}
 
 
 def camera_from_world(camera: Camera, origin: Sequence[float]) -> np.ndarray:
@@ -66,11 +63,6 @@ def intrinsics(camera: Camera) -> dict[str, Any]:
     """Return the intrinsics by nerfstudio's keys, px."""
     lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
     return lens | {"w": camera.width, "h": camera.height}
-
-
-def shared_values(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the intrinsics that all frames share; empty: they differ."""
-    return dict(each[0]) if all(one == each[0] for one in each) else {}
 
 
 def split_lists(pictures: Sequence[Picture], test: Sequence[Picture]) -> dict[str, list[str]]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,7 +28,10 @@ def zoom_name(factor: float) -> str:
 
 def zoomed_views(test: Sequence[Picture], factors: Sequence[float]) -> dict[float, Zoomed]:
     """Return the test views at each zoom; InputError: none has a photo that fine."""
-    zoomed = {factor: at_zoom(test, factor) for factor in factors}
+    zoomed = {
+        factor: {picture.file: view for picture in test if (view := picture.view.zoom(factor)) is not None}
+        for factor in factors
+    }
     for factor, views in zoomed.items():
         if test and not views:
             finest = max(picture.view.source.max_zoom(picture.camera) for picture in test)
@@ -40,34 +42,15 @@ def zoomed_views(test: Sequence[Picture], factors: Sequence[float]) -> dict[floa
     return zoomed
 
 
-def at_zoom(test: Sequence[Picture], factor: float) -> Zoomed:
-    """Return the test views at a zoom by file name."""
-    views = {picture.file: picture.view.zoom(factor) for picture in test}
-    return {file: view for file, view in views.items() if view is not None}
-
-
 def write_zoom(folder: Path, scene: Scene, factor: float, views: Zoomed) -> None:
     """Write `cameras_xK.json`, and the COLMAP model `test_xK/sparse/0`."""
     name = zoom_name(factor)
-    cameras = [camera_entry(file, view, scene.origin) for file, view in views.items()]
+    cameras = []
+    for file, view in views.items():
+        camera, matrix = view.camera, camera_from_world(view.camera, scene.origin)
+        values = {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+        poses = {"camera_from_world": matrix.tolist(), "world_from_camera": np.linalg.inv(matrix).tolist()}
+        cameras.append({"file": file, "name": view.name, **values, **poses})
     write_json(folder / f"cameras_{name}.json", {"zoom": factor, "convention": CONVENTION, "cameras": cameras})
     named = [(file, view.camera) for file, view in views.items()]
     write_model(folder / f"test_{name}" / "sparse" / "0", named, scene.points, scene.origin)
-
-
-def camera_entry(file: str, view: View, origin: Sequence[float]) -> dict[str, Any]:
-    """Return a camera by the conventions that the file states."""
-    camera = view.camera
-    matrix = camera_from_world(camera, origin)
-    return {
-        "file": file,
-        "name": view.name,
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "camera_from_world": matrix.tolist(),
-        "world_from_camera": np.linalg.inv(matrix).tolist(),
-    }

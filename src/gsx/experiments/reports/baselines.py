@@ -31,14 +31,26 @@ class Comparison:
     """Training time over that of the baseline."""
     seeds: list[int] = field(default_factory=list)
 
+    def add(self, run: RunFiles, baseline: RunFiles, seed: int) -> None:
+        """Adds one pair of runs."""
+        before, now = zooms(baseline), zooms(run)
+        for factor in now.keys() & before.keys():
+            self.gains[factor].append(now[factor] - before[factor])
+        seconds, baseline_seconds = (files.evaluation.get("train_seconds") for files in (run, baseline))
+        if is_number(seconds) and is_number(baseline_seconds) and baseline_seconds > 0:
+            self.cost.append(seconds / baseline_seconds)
+        self.seeds.append(seed)
+
 
 def compared(runs: Sequence[RunFiles]) -> list[list[Comparison]]:
     """Compares every augmentation that has a baseline among the runs; groups those that differ in options alone."""
     evaluated = [run for run in runs if run.evaluation]
-    baselines = {(key_of(run), seed_of(run)): run for run in evaluated if not part(run.config, "augmenter")}
+    seeds = [int(seed) if is_number(seed := run.config.get("seed")) else 0 for run in evaluated]
+    pairs = list(zip(evaluated, seeds, strict=True))
+    baselines = {(key_of(run), seed): run for run, seed in pairs if not part(run.config, "augmenter")}
     groups: dict[tuple[str, str], dict[str, Comparison]] = {}
-    for run in evaluated:
-        baseline = baselines.get((key_of(run), seed_of(run)))
+    for run, seed in pairs:
+        baseline = baselines.get((key_of(run), seed))
         if baseline is not None and part(run.config, "augmenter"):
             names = " + ".join(map(str, part(run.config, "augmenter")))
             group = groups.setdefault((key_of(run), names), {})
@@ -46,8 +58,9 @@ def compared(runs: Sequence[RunFiles]) -> list[list[Comparison]]:
                 run.backbone.split(" + ")[0],
                 [run.config.get("augmenter"), run.config.get("regenerator")],
             )
-            entry = Comparison(scene=run.scene, backbone=backbone, augmenters=names, options=options_of(run))
-            add(group.setdefault(json.dumps(chosen, sort_keys=True, default=str), entry), run, baseline)
+            options = flattened(part(run.config, "augmenter")) | flattened(part(run.config, "regenerator"))
+            entry = Comparison(scene=run.scene, backbone=backbone, augmenters=names, options=options)
+            group.setdefault(json.dumps(chosen, sort_keys=True, default=str), entry).add(run, baseline, seed)
     return [list(group.values()) for group in groups.values()]
 
 
@@ -55,28 +68,6 @@ def key_of(run: RunFiles) -> str:
     """Returns what runs of one comparison share: the composition except FREE, and the protocol."""
     shared = {key: value for key, value in run.config.items() if key not in FREE}
     return json.dumps([shared, run.protocol_hash], sort_keys=True, default=str)
-
-
-def options_of(run: RunFiles) -> dict[str, Any]:
-    """Returns the options of augmenters and regenerators by dotted key."""
-    return flattened(part(run.config, "augmenter")) | flattened(part(run.config, "regenerator"))
-
-
-def seed_of(run: RunFiles) -> int:
-    """Returns the run's seed."""
-    seed = run.config.get("seed")
-    return int(seed) if is_number(seed) else 0
-
-
-def add(entry: Comparison, run: RunFiles, baseline: RunFiles) -> None:
-    """Adds one pair of runs."""
-    before, now = zooms(baseline), zooms(run)
-    for factor in now.keys() & before.keys():
-        entry.gains[factor].append(now[factor] - before[factor])
-    seconds, baseline_seconds = (files.evaluation.get("train_seconds") for files in (run, baseline))
-    if is_number(seconds) and is_number(baseline_seconds) and baseline_seconds > 0:
-        entry.cost.append(seconds / baseline_seconds)
-    entry.seeds.append(seed_of(run))
 
 
 def zooms(run: RunFiles) -> dict[str, float]:

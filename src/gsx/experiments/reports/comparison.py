@@ -98,22 +98,24 @@ def scene_settings(run: RunFiles) -> str:
 def compared_runs(group: Group) -> dict[str, Any]:
     """Returns what the page shows of a group: legend, curves and plots."""
     styles = group.styles
-    plots = [plots_of(group, quality, styles) for quality in qualities_of(group)]
+    plots = [
+        {"key": one.key, "label": one.label, "title": one.title, "costs": plots_of(group, one, styles)}
+        for one in qualities_of(group)
+    ]
+    legend = []
+    for entry in group.entries:
+        points = held_out(entry.run)
+        seconds, psnr = points[-1] if points else (None, None)
+        facts = {"style": style(styles[entry.row["run"]]), "last_psnr": psnr, "last_seconds": seconds}
+        legend.append(entry.row | facts)
     return {
         "scene": group.scene,
         "protocol": group.protocol,
-        "legend": [legend_row(entry, styles) for entry in group.entries],
+        "legend": legend,
         "curves": curves_of(group, styles),
         "unmeasured": any(measures_nothing(entry.run.evaluation) for entry in group.entries),
         "plots": [plot for plot in plots if plot["costs"]],
     }
-
-
-def legend_row(entry: Entry, styles: dict[str, int]) -> dict[str, Any]:
-    """Returns style, name, state, and the last held-out PSNR with its time."""
-    points = held_out(entry.run)
-    seconds, psnr = points[-1] if points else (None, None)
-    return entry.row | {"style": style(styles[entry.row["run"]]), "last_psnr": psnr, "last_seconds": seconds}
 
 
 def held_out(run: RunFiles) -> list[tuple[float, float]]:
@@ -161,25 +163,26 @@ def perceptual_quality(rows: Sequence[dict[str, Any]], name: str, factor: str) -
     return Quality(key=f"{name}-{factor}", label=label, title=title, values=values, unit="", digits=4, sign=-1)
 
 
-def plots_of(group: Group, quality: Quality, styles: dict[str, int]) -> dict[str, Any]:
+def plots_of(group: Group, quality: Quality, styles: dict[str, int]) -> list[dict[str, Any]]:
     """Plots a figure against every cost that at least two runs have."""
-    plots = [plot_of(group, quality, cost, styles) for cost in COSTS]
-    title = {"key": quality.key, "label": quality.label, "title": quality.title}
-    return title | {"costs": [plot for plot in plots if plot]}
+    return [plot for cost in COSTS if (plot := plot_of(group, quality, cost, styles))]
 
 
 def plot_of(group: Group, quality: Quality, cost: str, styles: dict[str, int]) -> dict[str, Any]:
     """Plots points with their Pareto front; empty with fewer than two."""
-    values = quality.values
+    values, (axis, decimals) = quality.values, COSTS[cost]
+
+    def price(row: dict[str, Any]) -> str:
+        return f"{duration(row[cost])} of training" if cost == "seconds" else f"{fixed(row[cost], decimals)} {axis}"
+
     rows = [e.row for e in group.evaluated if is_number(e.row[cost]) and is_number(values[e.row["run"]])]
     if len(rows) < 2:
         return {}
-    axis, _ = COSTS[cost]
     dots = [
         Dot(
             x=row[cost],
             y=values[row["run"]],
-            text=f"{row['name']} ({row['run']}): {quality.words(row['run'])}, {price(row, cost)}",
+            text=f"{row['name']} ({row['run']}): {quality.words(row['run'])}, {price(row)}",
             label=row["name"] if len(row["name"]) <= LABEL else row["name"][: LABEL - 1] + "…",
             colour=styles[row["run"]],
             link=row["link"],
@@ -188,9 +191,3 @@ def plot_of(group: Group, quality: Quality, cost: str, styles: dict[str, int]) -
     ]
     front = pareto_front([dot.x for dot in dots], [quality.sign * dot.y for dot in dots])
     return {"svg": scatter(dots, x_label=axis, sign=quality.sign), "front": [rows[i] for i in front], "label": axis}
-
-
-def price(row: dict[str, Any], cost: str) -> str:
-    """Formats a cost of a run."""
-    axis, decimals = COSTS[cost]
-    return f"{duration(row[cost])} of training" if cost == "seconds" else f"{fixed(row[cost], decimals)} {axis}"

@@ -5,18 +5,21 @@ The page refers to pictures in the runs' folders.
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from gsx import __version__
-from gsx.core.errors import InputError
+from gsx.core.data.images import read_image
+from gsx.core.errors import GsxError, InputError
 from gsx.core.files import csv_text, remove_partial, replace_text
 from gsx.experiments.evaluation.remarks import NOT_MEASURED, measures_nothing
 from gsx.experiments.reports.baselines import baseline_rows
 from gsx.experiments.reports.comparison import Entry, compared_runs, groups_of
-from gsx.experiments.reports.page import address, template
-from gsx.experiments.reports.same_scene import number_namesakes
+from gsx.experiments.reports.page import address, counted, template
 from gsx.experiments.reports.side_by_side import pictures_of
 from gsx.experiments.run_folder.files import (
     STATES,
@@ -55,10 +58,12 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
     runs = number_namesakes([read_run(path) for path in (runs_in([folder]) if chosen is None else chosen)])
     rows, baselines = overview_rows(folder, runs), baseline_rows(runs)
     groups = groups_of([Entry(run=run, row=row) for run, row in zip(runs, rows, strict=True)])
+    count = counted(len(runs), "run")
+    together = all(Path(os.path.abspath(run.folder)).is_relative_to(os.path.abspath(folder)) for run in runs)
     remove_partial(folder, below=False)
     replace_text(folder / "report.csv", csv_text(FIELDS, rows))
     context = {
-        "title": title_of(folder, runs),
+        "title": f"{count} below {folder.resolve().name or folder}" if together else count,
         "version": __version__,
         "rows": rows,
         "states": {state: n for state in STATES if (n := sum(row["state"] == state for row in rows))},
@@ -74,13 +79,6 @@ def write_overview(folder: Path, chosen: Sequence[Path] | None = None) -> Path:
     path = folder / "report.html"
     replace_text(path, template("reports/overview.html").render(context))
     return path
-
-
-def title_of(folder: Path, runs: Sequence[RunFiles]) -> str:
-    """Says how many runs there are, and where if that is one place."""
-    count = f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}"
-    together = all(Path(os.path.abspath(run.folder)).is_relative_to(os.path.abspath(folder)) for run in runs)
-    return f"{count} below {folder.resolve().name or folder}" if together else count
 
 
 def runs_in(folders: Sequence[Path]) -> list[Path]:
@@ -153,7 +151,7 @@ def overview_row(folder: Path, run: RunFiles) -> dict[str, Any]:
         "perceptual": " ".join(f"{name}:{value:.4f}" for name, value in perceptual.items()),
         "perceptual_figures": perceptual,
         "perceptual_zoomed": {"1": perceptual}
-        | {factor: zoom_figures(entry, perceptual) for factor, entry in zoom.items()},
+        | {factor: {name: perceptual_figure(entry, name) for name in perceptual} for factor, entry in zoom.items()},
         "seconds": evaluation.get("train_seconds"),
         "gains": gains,
         "upscaled_gains": rivals,
@@ -163,11 +161,6 @@ def overview_row(folder: Path, run: RunFiles) -> dict[str, Any]:
         "zoom_upscaled_gains": by_zoom(rivals),
         "protocol": run.protocol_hash,
     }
-
-
-def zoom_figures(entry: dict[str, Any], names: Iterable[str]) -> dict[str, float | None]:
-    """Returns the perceptual figures of a zoomed render by metric."""
-    return {name: perceptual_figure(entry, name) for name in names}
 
 
 def by_zoom(values: dict[str, float]) -> str:
@@ -188,7 +181,8 @@ def differences(runs: Sequence[RunFiles]) -> list[str]:
     flat = [comparable(run.config) for run in runs]
     out = [""] * len(runs)
     for members in groups.values():
-        varied = varied_keys([flat[i] for i in members])
+        keys = dict.fromkeys(key for i in members for key in flat[i])
+        varied = [key for key in keys if len({repr(flat[i].get(key)) for i in members}) > 1]
         more = f", and {len(varied) - DIFFERENCES} more" if len(varied) > DIFFERENCES else ""
         for i in members:
             out[i] = ", ".join(f"{key}={flat[i].get(key, 'absent')}" for key in varied[:DIFFERENCES]) + more
@@ -208,12 +202,6 @@ def names_of(rows: Sequence[dict[str, Any]]) -> list[str]:
     return names
 
 
-def varied_keys(configs: Sequence[dict[str, Any]]) -> list[str]:
-    """Lists keys whose values are not the same in all configurations, in their order."""
-    keys = dict.fromkeys(key for config in configs for key in config)
-    return [key for key in keys if len({repr(config.get(key)) for config in configs}) > 1]
-
-
 def mixed_protocols(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
     """Counts runs by protocol for scenes that were evaluated by several."""
     counts: dict[str, Counter[str]] = {}
@@ -221,3 +209,41 @@ def mixed_protocols(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]
         if row["protocol"]:
             counts.setdefault(row["scene"], Counter())[row["protocol"]] += 1
     return {scene: dict(by_hash) for scene, by_hash in counts.items() if len(by_hash) > 1}
+
+
+def number_namesakes(runs: Sequence[RunFiles]) -> list[RunFiles]:
+    """Numbers the scenes of one name that differ (`RunFiles.namesake`)."""
+    first: dict[str, list[RunFiles]] = {}
+    out = []
+    for run in runs:
+        known = first.setdefault(run.scene, [])
+        number = next((n for n, other in enumerate(known) if not differ(run, other)), len(known))
+        if number == len(known):
+            known.append(run)
+        out.append(replace(run, namesake=number))
+    return out
+
+
+def differ(run: RunFiles, other: RunFiles) -> bool:
+    """Returns whether scenes in different folders have other pixels in a test photo of one name and size."""
+    if part(run.config, "scene").get("path") == part(other.config, "scene").get("path"):
+        return False
+    truths, others = truths_of(run), truths_of(other)
+    return any(unlike(truths[key], others[key]) for key in truths.keys() & others.keys())
+
+
+def truths_of(run: RunFiles) -> dict[tuple[str, str], Path]:
+    """Returns the photos of drawn test views by name and size."""
+    return {
+        (str(view.get("name")), str(view["size"])): run.folder / "renders" / Path(view["files"]["truth"]).name
+        for view in run.pictures.get("views", [])
+        if part(view, "files").get("truth")
+    }
+
+
+def unlike(one: Path, other: Path) -> bool:
+    """Returns whether two picture files have other pixels; False where one cannot be read."""
+    try:
+        return one.read_bytes() != other.read_bytes() and not torch.equal(read_image(one), read_image(other))
+    except (OSError, GsxError):
+        return False

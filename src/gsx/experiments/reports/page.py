@@ -23,6 +23,11 @@ def signed(value: Any, digits: int = 2) -> str:
     return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}") if is_number(value) else NONE
 
 
+def counted(number: int, noun: str) -> str:
+    """Returns a number with its noun."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def share(value: Any) -> str:
     """Formats a share of 1 in per cent, or n/a."""
     return f"{100 * value:.0f} %" if is_number(value) else NONE

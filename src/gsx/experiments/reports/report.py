@@ -93,6 +93,9 @@ def report_context(run: RunFiles) -> dict[str, Any]:
     evaluation, zoom = run.evaluation, zoom_rows(run.evaluation)
     views = evaluation.get("views", [])
 
+    def psnr(view: dict[str, Any]) -> float:
+        return view["psnr"] if is_number(view.get("psnr")) else -math.inf
+
     def embed(folder: str, name: Any) -> str | None:
         return embedded(run.folder / folder / Path(str(name)).name)
 
@@ -126,7 +129,7 @@ def report_context(run: RunFiles) -> dict[str, Any]:
         "held_out": any("test_psnr" in line for line in run.lines),
         "embed": embed,
         "views": views,
-        "worst": sorted(views, key=quality)[:WORST],
+        "worst": sorted(views, key=psnr)[:WORST],
         "newest": newest_checkpoint(run.folder),
         "pages": sorted(path.name for path in run.folder.glob("*.html") if path.name != "report.html"),
         "percent": lambda step: round(100 * min(max(float(step), 0), run.iterations) / run.iterations, 2),
@@ -167,12 +170,6 @@ def embedded(path: Path) -> str | None:
     return f"data:image/{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
-def quality(view: dict[str, Any]) -> float:
-    """Returns PSNR for sorting; views without one come first."""
-    value = view.get("psnr")
-    return value if is_number(value) else -math.inf
-
-
 def zoom_rows(evaluation: dict[str, Any]) -> list[dict[str, Any]]:
     """Returns figures and gains of each zoom, in order."""
     return [
@@ -183,7 +180,10 @@ def zoom_rows(evaluation: dict[str, Any]) -> list[dict[str, Any]]:
             "upscaled_gain": over_upscaled(entry),
             "ssim_gain": None if factor == "1" else gain_of(entry, "ssim"),
             "detail": {kind: detail_share(entry, kind) for kind in DETAIL_OF},
-            "perceptual": perceptual_pictures(entry, perceptual_names(evaluation)),
+            "perceptual": {
+                name: {kind: perceptual_figure(entry, name, kind) for kind in COMPARED}
+                for name in perceptual_names(evaluation)
+            },
         }
         for factor, entry in sorted(part(evaluation, "zoom").items(), key=lambda item: float(item[0]))
     ]
@@ -200,14 +200,9 @@ def zoom_groups(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def consistency_rows(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Returns the consistency of neighbouring views at the zooms where it was measured."""
-    found = [(row["factor"], part(row["entry"], "consistency")) for row in rows]
-    measured = [(factor, levels) for factor, levels in found if is_number(levels.get("render"))]
-    return [{"factor": factor, **levels, "detail": part(levels, "detail")} for factor, levels in measured]
-
-
-def perceptual_pictures(entry: dict[str, Any], names: Sequence[str]) -> dict[str, dict[str, float | None]]:
-    """Returns the perceptual figures at a zoom by metric and picture."""
-    return {name: {kind: perceptual_figure(entry, name, kind) for kind in COMPARED} for name in names}
+    found = {row["factor"]: part(row["entry"], "consistency") for row in rows}
+    known = {factor: levels for factor, levels in found.items() if is_number(levels.get("render"))}
+    return [{"factor": factor, **levels, "detail": part(levels, "detail")} for factor, levels in known.items()]
 
 
 def zoom_chart(rows: Sequence[dict[str, Any]]) -> Markup:

@@ -12,7 +12,7 @@ from typing import Any
 
 from gsx.core.errors import command
 from gsx.experiments.reports.comparison import Entry, Group
-from gsx.experiments.run_folder.files import RunFiles, gain_of, part
+from gsx.experiments.run_folder.files import gain_of, part
 from gsx.experiments.run_folder.shapes import is_number
 
 PNG, JPEG = (b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"), (b"\xff\xd8\xff", b"\xff\xd9")
@@ -49,7 +49,15 @@ def pictures_of(group: Group, folder: Path) -> dict[str, Any]:
         "views": {f"v{number}": view for number, view in enumerate(views)},
         "factors": {f"z{factor:g}": f"×{factor:g}" for factor in factors},
         "sets": [set_of(shots, entries, f"v{views.index(shots[0].view)}", folder) for shots in sets],
-        "without": [without(entry) for entry in entries if not entry.run.pictures],
+        "without": [
+            {
+                "name": entry.name,
+                "reason": entry.run.problems.get("renders/index.json", "renders/index.json is missing"),
+                "remedy": command("eval", entry.run.folder),
+            }
+            for entry in entries
+            if not entry.run.pictures
+        ],
     }
 
 
@@ -129,10 +137,3 @@ def is_complete(path: Path) -> bool:
             return starts and stream.read() == end
     except (OSError, ValueError):
         return False
-
-
-def without(entry: Entry) -> dict[str, str]:
-    """Explains why a run with figures has no pictures."""
-    run: RunFiles = entry.run
-    reason = run.problems.get("renders/index.json", "renders/index.json is missing")
-    return {"name": entry.name, "reason": reason, "remedy": command("eval", run.folder)}

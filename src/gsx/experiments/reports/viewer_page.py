@@ -47,7 +47,10 @@ def viewer_page(
 
     `up`: unit vector of the scene; `background`: display RGB in [0, 1].
     """
-    rotation = rotation_between(level(up, views[0].camera), torch.tensor([0.0, -1.0, 0.0]))  # files have y down
+    right = views[0].camera.rotation[0].double()  # the viewer's cameras have no roll: turn the scene by a small one
+    across = torch.nn.functional.normalize(up.double() - (up.double() @ right) * right, dim=0)
+    level = across if float(across @ up.double()) > LEAST_LEVEL else up
+    rotation = rotation_between(level, torch.tensor([0.0, -1.0, 0.0]))  # files have y down
     splats = encode_compressed_ply(arrays_of(turned(gaussians, rotation)), comments)
     poses = [pose(view.camera, rotation, gaussians.means) for view in views]
     content = {
@@ -59,13 +62,6 @@ def viewer_page(
     page = page.replace("<title>SuperSplat Viewer</title>", f"<title>{html.escape(title)}</title>", 1)
     before, _, after = page.partition(PLACE)
     return before + json.dumps(content).replace("<", "\\u003c") + after
-
-
-def level(up: Float[Tensor, "3"], camera: Camera) -> Float[Tensor, "3"]:
-    """Turns the scene's up direction by the small roll of a camera, since the viewer's cameras have none."""
-    right = camera.rotation[0].double()
-    across = torch.nn.functional.normalize(up.double() - (up.double() @ right) * right, dim=0)
-    return across if float(across @ up.double()) > LEAST_LEVEL else up
 
 
 def pose(camera: Camera, rotation: Float[Tensor, "3 3"], means: Float[Tensor, "N 3"]) -> dict[str, object]:

@@ -162,7 +162,8 @@ def restore(run: Run, training: bool = False) -> None:
     except (KeyError, RuntimeError, TypeError) as error:
         raise CheckpointError(f"the checkpoint of {run.folder} has no random state ({error}): remove it") from error
     for prefix, module in run.modules.items():
-        module.load_state_dict(pop_prefixed(tensors, f"{prefix}."))
+        names = [name for name in tensors if name.startswith(f"{prefix}.")]
+        module.load_state_dict({name.removeprefix(f"{prefix}."): tensors.pop(name) for name in names})
     run.backbone.table = restore_table(run.backbone.table, tensors)
     run.step, run.progress.seconds = int(meta["step"]), float(meta["seconds"])
     run.sampler.order = list(meta["sampler"])
@@ -180,8 +181,3 @@ def refuse_other_views(run: Run, trained: dict[str, list[str]]) -> None:
                 f"{run.folder} was trained with other {part} views (now {len(names)}, then {len(trained[part])}; "
                 f"first difference: {changed[0] if changed else 'their order'}): restore the scene and its split"
             )
-
-
-def pop_prefixed(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Remove the tensors whose names have a prefix; return them without it."""
-    return {name.removeprefix(prefix): tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}

@@ -104,13 +104,11 @@ def without(node: Any, keys: Collection[str], prefix: str = "") -> Any:
 def scene_stamp(config: dict[str, Any]) -> str:
     """Return a digest of a composition's scene and splat file; empty without any, `absent: FOLDER` if missing."""
     of_folder, file = folder_stamp(config), splat_file(config.get("init"))
-    return content_key(of_folder, splat_stamp(file)) if file is not None and file.is_file() else of_folder
-
-
-def splat_stamp(file: Path) -> tuple[Any, ...]:
-    """Return the stamp of a splat file, with the pictures of an unbundled SOG."""
+    if file is None or not file.is_file():
+        return of_folder
     others = sorted(file.parent.iterdir()) if file.name.lower() == META else []
-    return *file_stamp(file), *(file_stamp(other) for other in others if other.suffix.lower() in PICTURES)
+    pictures = [other for other in others if other.suffix.lower() in PICTURES]  # of an unbundled SOG
+    return content_key(of_folder, (*file_stamp(file), *map(file_stamp, pictures)))
 
 
 def folder_stamp(config: dict[str, Any]) -> str:
@@ -202,13 +200,12 @@ def evaluated_alike(saved: dict[str, Any], now: dict[str, Any]) -> bool:
 
     Keys of EVALUATION that are newer do not count, except those of UNCHANGED that have another value.
     """
-    return saved == now | {group: counting(group, part(now, group), part(saved, group)) for group in EVALUATION}
 
+    def counts(group: str, key: str, value: Any) -> bool:
+        return key in part(saved, group) or UNCHANGED.get(f"{group}.{key}", value) != value
 
-def counting(group: str, now: dict[str, Any], saved: dict[str, Any]) -> dict[str, Any]:
-    """Select the values of now whose keys are saved, or whose key of UNCHANGED has another value."""
-    changed = {key for key, value in now.items() if UNCHANGED.get(f"{group}.{key}", value) != value}
-    return {key: value for key, value in now.items() if key in saved or key in changed}
+    groups = {group: {k: v for k, v in part(now, group).items() if counts(group, k, v)} for group in EVALUATION}
+    return saved == now | groups
 
 
 def comparable(config: dict[str, Any]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import os
 import platform
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +85,6 @@ def prepare_process(device: torch.device, training: bool) -> None:
         torch.cuda.reset_peak_memory_stats(device)  # of an earlier run in this process
         convolve_exactly()
     keep_compiled_code()
-    hasten_compiling()
 
 
 def convolve_exactly() -> None:
@@ -94,20 +93,18 @@ def convolve_exactly() -> None:
     torch.backends.cudnn.deterministic = True
 
 
-def hasten_compiling() -> None:
-    """Set environment variables that torch's compiler reads when it is first needed."""
-    # torch would compile and load programs to find the vector registers: the system reports them
-    os.environ.setdefault("TORCHINDUCTOR_VEC_ISA_OK", "1")
-    # caching sizes and formats of each operation costs more than computing them again where sizes are symbols
-    os.environ.setdefault("TORCH_FAKE_TENSOR_DISPATCH_CACHE", "0")
-
-
 def keep_compiled_code() -> None:
     """Keep what torch compiles in the cache, by kind of processor: torch's own place is lost on restart.
+
+    Compiling is also hastened, by variables that torch reads when it first compiles.
 
     Raises:
         InputError: there is no cache, for want of a home folder.
     """
+    # torch would compile and load programs to find the vector registers: the system reports them
+    os.environ.setdefault("TORCHINDUCTOR_VEC_ISA_OK", "1")
+    # caching sizes and formats of each operation costs more than computing them again where sizes are symbols
+    os.environ.setdefault("TORCH_FAKE_TENSOR_DISPATCH_CACHE", "0")
     folder = cache_folder("compiled", content_key(torch.__version__, platform.python_version(), processor_kind()))
     try:
         (make_folder(folder) / MANIFEST).touch()
@@ -187,7 +184,14 @@ def build_modules(settings: Settings, scene: Scene, device: torch.device) -> Mod
 
 def build_augmenters(settings: Settings, scene: Scene, new_backbone: NewBackbone) -> dict[str, Augmenter]:
     """Build the augmenters of a run, in order; they share regenerators by role."""
-    regenerator = cache(partial(regenerator_of, settings=settings))
+
+    @cache
+    def regenerator(role: str) -> Regenerator:
+        if role not in settings.regenerators:
+            raise ConfigError(f"no regenerator is chosen for '{role}': add regenerator/{role}=NAME")
+        chosen = settings.regenerators[role]
+        return chosen.component.factory(chosen.options)
+
     augmenters: dict[str, Augmenter] = {}
     for name, chosen in settings.augmenters.items():
         context = AugmenterContext(
@@ -205,14 +209,6 @@ def build_augmenters(settings: Settings, scene: Scene, new_backbone: NewBackbone
         listed = ", ".join(f"{name} {share:g}" for name, share in shares.items())
         raise ConfigError(f"augmenters replace the whole loss of the photos ({listed}): lower their weights")
     return augmenters
-
-
-def regenerator_of(role: str, settings: Settings) -> Regenerator:
-    """Build the regenerator of a role; raise ConfigError if none is chosen."""
-    if role not in settings.regenerators:
-        raise ConfigError(f"no regenerator is chosen for '{role}': add regenerator/{role}=NAME")
-    chosen = settings.regenerators[role]
-    return chosen.component.factory(chosen.options)
 
 
 def plan_of(run: Run) -> dict[str, Any]:

@@ -18,7 +18,8 @@ from gsx.core.training.backbone import BackboneContext
 from gsx.core.training.training_views import TrainingViews
 from gsx.engine.compile_ahead import Step, compiling_early, warm_camera
 from gsx.engine.joined_ranks import current_ranks
-from gsx.experiments.runs.build import choose_device, hasten_compiling, keep_compiled_code
+from gsx.experiments.runs.build import choose_device, keep_compiled_code
+from gsx.experiments.runs.logs import quiet
 from gsx.experiments.runs.rasterizer_path import compiles, rules_of_step
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import in_front_of, one_point
@@ -44,8 +45,7 @@ def compiling_before(settings: Settings) -> Iterator[None]:
     """Compile during the context what a run's steps need, in a second process, if that is not on disk."""
     with ExitStack() as stack:
         if worthwhile(settings):
-            keep_compiled_code()  # before the backbone: its optimiser imports torch's compiler, which reads these
-            hasten_compiling()
+            keep_compiled_code()  # before the backbone: its optimiser imports torch's compiler
             if (step := early_step(settings)) is not None:
                 stack.enter_context(compiling_early(step))
         yield
@@ -72,24 +72,12 @@ def early_step(settings: Settings) -> Step | None:
         begins=False,
     )
     try:
-        with torch.random.fork_rng(devices=[]), quiet():
+        with torch.random.fork_rng(devices=[]), quiet(logging.CRITICAL):
             backbone = settings.backbone.component.factory(settings.backbone.options, context)
     except Exception as error:  # a plugin may need more than one point; a wrong option is refused later
         logger.info("compiling waits for the scene (%s)", first_line(error))
         return None
     return rules_of_step(backbone, backbone.raster)
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Suppress the messages of gsx inside the context."""
-    package = logging.getLogger("gsx")
-    before = package.level
-    package.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        package.setLevel(before)
 
 
 def placeholder_scene() -> Scene:

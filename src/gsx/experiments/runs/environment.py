@@ -31,7 +31,7 @@ POSE_DIGITS = 6
 
 def environment(run: Run, plugins: Plugins, idle: Collection[str]) -> dict[str, Any]:
     """Return the content of environment.json; `idle`: keys that change no result."""
-    scene = run.scene
+    scene, points = run.scene, [point for point in entry_points(group=GROUP) if point.dist]
     return {
         "gsx": __version__,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
@@ -45,7 +45,7 @@ def environment(run: Run, plugins: Plugins, idle: Collection[str]) -> dict[str, 
         "processes": run.ranks.size,
         "packages": {name: installed_version(name) for name in PACKAGES},
         "plugins": plugins.versions,
-        "distributions": distributions(plugins.versions),
+        "distributions": {one.name: one.dist.name for one in points if one.dist and one.name in plugins.versions},
         "options": composition_key(run.config, "", idle),
         "plan": plan_of(run),
         "training_focal": max(view.camera.focal for view in scene.train),
@@ -83,11 +83,6 @@ def installed_version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "not installed"
-
-
-def distributions(names: Collection[str]) -> dict[str, str]:
-    """Return the distributions that plugins were installed by, by plugin."""
-    return {point.name: point.dist.name for point in entry_points(group=GROUP) if point.dist and point.name in names}
 
 
 def announce(run: Run, plugins: Plugins) -> None:

@@ -3,7 +3,6 @@
 import logging
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from gsx.augmenters.store import load_views, picture_name
@@ -162,18 +161,16 @@ def zoom_line(factor: str, result: dict[str, Any], upscaler: str = "an upscaler"
     if factor == "1":
         return f"zoom x1: {result['psnr']:.2f} dB"
     resized = "enlarged" if float(factor) > 1 else "reduced"
-    text = f"zoom x{factor}: {result['psnr']:.2f} dB, {verdict(result, 'enlarged')} the {resized} x1 render"
-    text += f" ({result['enlarged_psnr']:.2f} dB)"
-    if "upscaled_psnr" in result:
-        text += f", {verdict(result, 'upscaled')} the x1 render enlarged by {upscaler}"
-        text += f" ({result['upscaled_psnr']:.2f} dB)"
+    text = f"zoom x{factor}: {result['psnr']:.2f} dB"
+    for rival, words in {
+        "enlarged": f"the {resized} x1 render",
+        "upscaled": f"the x1 render enlarged by {upscaler}",
+    }.items():
+        if f"{rival}_psnr" in result:
+            verdict = "wins against" if result[f"beats_{rival}"] else "loses to"
+            text += f", {verdict} {words} ({result[f'{rival}_psnr']:.2f} dB)"
     names = {"enlarged": f"x1 {resized}", "upscaled": f"by {upscaler}", "photograph": "photo"}
     return text + detail_text(result, names) + "".join(perceptual_texts(result, names))
-
-
-def verdict(result: dict[str, Any], rival: str) -> str:
-    """Return whether the zoomed render wins."""
-    return "wins against" if result[f"beats_{rival}"] else "loses to"
 
 
 def detail_text(result: dict[str, Any], names: dict[str, str]) -> str:
@@ -221,17 +218,12 @@ def write_pseudo_pictures(run: Run, options: EvalOptions) -> None:
         except (OSError, ValueError) as error:
             logger.warning("%s cannot be read (%s): the report omits its pseudo views", path, error)
             continue
-        pictured = with_pictures(folder, augmenter, views)[:MOST_VIEWS]
+        complete = [view for view in views if {"event", "scale", "kind"} <= view.provenance.keys()]
+        by_name = {picture_name(augmenter, view): view for view in complete}  # one view for each picture
+        pictured = [view for name, view in by_name.items() if (folder / name).is_file()][:MOST_VIEWS]
         entries += [picture_entry(run, options, augmenter, view) for view in pictured]
     if entries:
         write_json(folder / "index.json", {"views": entries})
-
-
-def with_pictures(folder: Path, augmenter: str, views: list[PseudoView]) -> list[PseudoView]:
-    """Return one view for each existing picture."""
-    complete = [view for view in views if {"event", "scale", "kind"} <= view.provenance.keys()]
-    by_name = {picture_name(augmenter, view): view for view in complete}
-    return [view for name, view in by_name.items() if (folder / name).is_file()]
 
 
 def picture_entry(run: Run, options: EvalOptions, augmenter: str, view: PseudoView) -> dict[str, Any]:

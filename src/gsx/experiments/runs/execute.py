@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from gsx.experiments.runs.export import export
 from gsx.experiments.runs.guard import Agreement, Guard
 from gsx.experiments.runs.open import refuse_code, reopened
 from gsx.experiments.runs.progress import MetricsLog, Progress
-from gsx.experiments.runs.rasterizer_path import warm
+from gsx.experiments.runs.rasterizer_path import warm, warm_or_eager
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.tracking import announce_failure, build_trackers, reason_of
 
@@ -95,7 +94,9 @@ def execute(run: Run, settings: Settings, plugins: Plugins, keep_states: bool = 
         states = warm_start.warm_start_folder(run, settings.idle, plugins.versions)
         listeners.append(warm_start.WarmStartKeeper(states, general.disk_cache_gb, general.warm_start_at))
     try:
-        warm_or_eager(run, settings)
+        if warm_or_eager(run, settings.raster.path):
+            facts = read_json(run.folder / "environment.json")
+            write_json(run.folder / "environment.json", facts | {"rasterizer": "eager"})
         with (
             viewed(run, settings) as viewers,
             plugins.listening([*listeners, *viewers]),
@@ -113,20 +114,6 @@ def execute(run: Run, settings: Settings, plugins: Plugins, keep_states: bool = 
     if not run.complete:
         status(run, "interrupted")
         write_report(run.folder)
-
-
-def warm_or_eager(run: Run, settings: Settings) -> None:
-    """Compile what steps need; if that fails at the start of a run with path=auto, use the eager path."""
-    try:
-        warm(run)
-    except CompilerError as error:
-        chosen_by_gsx = settings.raster.path == "auto" and run.raster.path == "compiled"
-        if not chosen_by_gsx or run.step > 0 or run.ranks.size > 1:
-            raise
-        logger.warning("%s; using the eager path, which is several times slower", error)
-        run.raster = run.backbone.raster = replace(run.raster, path="eager")
-        facts = read_json(run.folder / "environment.json")
-        write_json(run.folder / "environment.json", facts | {"rasterizer": "eager"})
 
 
 @contextmanager

@@ -58,11 +58,16 @@ def explain(key: str, overrides: Sequence[str], plugins: Plugins) -> list[str]:
         value = value_at(key, values)
         typed = [word.partition("=")[2] for word in overrides if word.startswith(f"{key}=")]
         details = [kind_of(key, settings), *(f"command line  {word}" for word in typed)]
-        details += [line for entry in reversed(entries(files, dotted_key)) for line in lines_of(entry)]
+        for entry in reversed(entries(files, dotted_key)):
+            details += [f"set in {entry.place}  {entry.value}".rstrip(), entry.comment and f"    {entry.comment}"]
         lines = [key if value is MISSING or isinstance(value, dict) else f"{key} = {written(value)}"]
         lines += [f"  {detail}" for detail in details if detail]
         if key in groups:
-            lines += ["", f"{key}=NAME, one of (* chosen)", *options_of(key, compositions, files)]
+            chosen = {file.source.file for file in files} - included(key, files)
+            lines += ["", f"{key}=NAME, one of (* chosen)"]
+            for name in listed(key):
+                file = compositions.file(f"{key}/{name}")
+                lines.append(f"{'*' if file in chosen else ' '} {name:24} {head_of(file)}".rstrip())
         return lines + below(dotted_key, values, files)
 
 
@@ -80,13 +85,6 @@ def key_of_another_choice(key: str, overrides: Sequence[str], compositions: Comp
     return ""
 
 
-def options_of(group: str, compositions: Compositions, files: Sequence[Parsed]) -> list[str]:
-    """Return a line for each option of a group; those of the composition are marked."""
-    chosen = {file.source.file for file in files} - included(group, files)
-    places = {name: compositions.file(f"{group}/{name}") for name in listed(group)}
-    return [f"{'*' if file in chosen else ' '} {name:24} {head_of(file)}".rstrip() for name, file in places.items()]
-
-
 def included(group: str, files: Sequence[Parsed]) -> set[Path]:
     """Return the files of a group that others of the same group start from."""
     members = [file for file in files if file.source.file.parent.name == group.rpartition("/")[2]]
@@ -101,12 +99,6 @@ def written(value: Any) -> str:
     """Return a value in the syntax of the command line."""
     text = yaml.safe_dump(value, default_flow_style=True, width=1 << 20, allow_unicode=True)
     return text.removesuffix("\n...\n").strip()
-
-
-def lines_of(entry: Entry) -> list[str]:
-    """Return an entry in lines."""
-    first = f"set in {entry.place}  {entry.value}".rstrip()
-    return [first, f"    {entry.comment}"] if entry.comment else [first]
 
 
 def below(key: str, node: dict[str, Any], files: Sequence[Parsed]) -> list[str]:

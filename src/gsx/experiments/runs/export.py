@@ -90,9 +90,12 @@ def write_model(
         InputError: the format cannot hold the splats.
     """
     origin, stated = placement(run.scene.origin, local or is_page(path))
-    comments = [*notes(run), *stated, f"SplatRenderMode: {render_mode(run.raster)}", *remarks]
+    comments = [*notes(run), *stated, mode_note(run.raster.compensate), *remarks]
     if is_page(path):
-        write_whole(path, page_of(run, gaussians, comments).encode())
+        up = upright(torch.stack([view.camera.rotation for view in run.scene.train]).double())
+        views, background = evaluation_views(run.scene)[:PAGE_VIEWS], run.scene.background.tolist()
+        page = viewer_page(gaussians, views, up, background, f"{run.scene.name}, gsx", comments)
+        write_whole(path, page.encode())
     else:
         refuse_too_far(path, gaussians, origin)
         write_gaussians(path, gaussians, comments, run.raster.compensate, spz, origin)
@@ -140,13 +143,6 @@ def refuse_export(path: Path, spz: SpzForm = SPZ_FORM) -> None:
         raise InputError(f"axes and SPZ version are for .spz files, not for {path}: leave them out, or write model.spz")
 
 
-def page_of(run: Run, gaussians: Gaussians, comments: Sequence[str]) -> str:
-    """Return a page that starts at the first test view, or training view if none is held out."""
-    up = upright(torch.stack([view.camera.rotation for view in run.scene.train]).double())
-    views, background = evaluation_views(run.scene)[:PAGE_VIEWS], run.scene.background.tolist()
-    return viewer_page(gaussians, views, up, background, f"{run.scene.name}, gsx", comments)
-
-
 def evaluation_views(scene: Scene) -> Sequence[View]:
     """Return the test views of a scene, or its training views if none is held out."""
     return scene.test or scene.train
@@ -155,15 +151,22 @@ def evaluation_views(scene: Scene) -> Sequence[View]:
 def notes(run: Run) -> list[str]:
     """Return comments for viewers: source, screen dilation, zoom rules, units."""
     file_notes = run.backbone.file_notes() if isinstance(run.backbone, WithOwnFile) else ()
+    times, reduction = run.views.raster_scale(run.model_step), run.scene.reduction.filter
+    finer = f"trained through renders {times} times as fine, reduced by the {reduction} filter"
     return [
         f"gsx {__version__}, step {run.step}, scene {run.scene.name}, in its units times {unit_of(run):g}",
         f"screen dilation {run.raster.dilation} px^2, {'with' if run.raster.compensate else 'no'} opacity compensation",
         *([f"trained around {in_words(run.scene.origin)}"] if any(run.scene.origin) else []),
         *zoomed_note(run.raster),
-        *supersampling_note(run),
+        *([finer] if times > 1 else []),
         *file_notes,
         "quaternions w x y z; scales ln; opacity logit; f_rest channel-major",
     ]
+
+
+def mode_note(compensated: bool) -> str:
+    """Return the comment that Brush and SuperSplat read: `mip` compensates opacities for screen dilation."""
+    return f"SplatRenderMode: {'mip' if compensated else 'default'}"
 
 
 def zoomed_note(raster: RasterSettings) -> list[str]:
@@ -175,18 +178,6 @@ def zoomed_note(raster: RasterSettings) -> list[str]:
         opacity = f"opacity x sqrt(|S + {raster.dilation} k^2 I| / |S + dilation I|), at most {raster.alpha_max}"
         return [f"{finer} {raster.dilation - PIXEL_VARIANCE:.6g} k^2 + {PIXEL_VARIANCE} px^2, {opacity}"]
     return []
-
-
-def supersampling_note(run: Run) -> list[str]:
-    """Return the supersampling of training, if any."""
-    times = run.views.raster_scale(run.model_step)
-    filter_ = run.scene.reduction.filter
-    return [f"trained through renders {times} times as fine, reduced by the {filter_} filter"] if times > 1 else []
-
-
-def render_mode(raster: RasterSettings) -> str:
-    """Return the value of SplatRenderMode (Brush, SuperSplat): `mip` compensates opacities for screen dilation."""
-    return "mip" if raster.compensate else "default"
 
 
 def losses(
@@ -210,21 +201,16 @@ def losses(
 
     own = [render(run, view.camera, settings.evaluation.tile_pixels).image for view in views]
     read, before = pictures(again), pictures(inside) if written.baked else own
-    worst = min(psnr(a, b) for a, b in zip(read, before, strict=True))
+    worst = min(map(psnr, read, before))
     lines = [f"{worst:.1f} dB at worst over {len(views)} views (inf: identical), {path.stat().st_size / 1e6:,.2f} MB"]
     if written.baked:
         truth = [view.image().to(own[0]) for view in views]
-        alike, model, baked = (mean_psnr(a, b) for a, b in ((before, own), (own, truth), (before, truth)))
+        alike, model, baked = (fmean(map(psnr, a, b)) for a, b in ((before, own), (own, truth), (before, truth)))
         lines.append(
             f"baked for all views: {alike:.1f} dB against the model; {baked:.2f} dB against photos, the model has "
             f"{model:.2f} dB: {model - baked:.2f} dB lost"
         )
     return lines
-
-
-def mean_psnr(pictures: Sequence[Float[Tensor, "3 H W"]], others: Sequence[Float[Tensor, "3 H W"]]) -> float:
-    """Return the mean PSNR over pairs."""
-    return fmean(psnr(a, b) for a, b in zip(pictures, others, strict=True))
 
 
 def as_in_page(gaussians: Gaussians) -> Gaussians:
@@ -246,7 +232,7 @@ def convert(source: Path, to: Path, axes: str = AUTO, spz: SpzForm = SPZ_FORM, l
     (gaussians, origin), mip = read_around(source, axes), compensated(source)
     if not len(gaussians.means):
         raise InputError(f"{source} holds no splats: choose another file")
-    comments = [f"gsx {__version__}, from {source.name}", f"SplatRenderMode: {'mip' if mip else 'default'}"]
+    comments = [f"gsx {__version__}, from {source.name}", mode_note(mip)]
     added, stated = placement(origin, local)
     refuse_too_far(to, gaussians, added)
     write_gaussians(to, gaussians, [*comments, *stated], mip, spz, added)
@@ -287,7 +273,9 @@ def log_coordinates(path: Path, origin: Origin, local: bool, gaussians: Gaussian
         return
     suffix, middle = suffix_of(path), in_words(origin)
     step = rounding_at(torch.tensor([origin]))
-    scales = "" if gaussians is None else f" ({step / median_scale(gaussians):.2g} x the median scale of splats)"
+    scales = ""
+    if gaussians is not None and len(gaussians.means):
+        scales = f" ({step / float(gaussians.log_scales.median().exp()):.2g} x the median scale of splats)"
     steps, remedy = f"steps of {step:.2g} units{scales}", f"--local writes them relative to {middle}"
     if local:
         states = "as its comment states" if suffix in COMMENTED else f"which {suffix} has no place to state"
@@ -299,8 +287,3 @@ def log_coordinates(path: Path, origin: Origin, local: bool, gaussians: Gaussian
     else:
         message = f"positions are the scene's own; programs that read only floats round them to {steps}: {remedy}"
     logger.info("%s: %s", path, message)
-
-
-def median_scale(gaussians: Gaussians) -> float:
-    """Return the median standard deviation of Gaussians along their axes, scene units."""
-    return float(gaussians.log_scales.median().exp()) if len(gaussians.means) else 1.0

@@ -6,13 +6,11 @@ from math import isnan, nan
 from statistics import fmean
 
 import torch
-from torch import Tensor
 
-from gsx.core.data.scene import Scene, View
+from gsx.core.data.scene import Scene
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.quality.metrics import psnr
 from gsx.core.rasterizer import RasterSettings
-from gsx.core.shapes import Float
 from gsx.core.training.render import render_gaussians
 from gsx.experiments.runs.settings import Settings
 from gsx.experiments.runs.start_file import (
@@ -76,7 +74,7 @@ def in_axes_of(scene: Scene, content: SplatContent | None) -> Gaussians | None:
     fits = {content.axes: fit(content.gaussians, scene), other: fit(turned, scene)}
     best = better(fits)
     if content.by == "specified":
-        if best is None and in_view(fits):
+        if best is None and max(fit.in_view for fit in fits.values()) >= LEAST_IN_VIEW:
             candidates = {content.axes: content.gaussians, other: turned}
             fits = {axes: replace(fits[axes], likeness=likeness(candidates[axes], scene)) for axes in fits}
             best = more_alike(fits)
@@ -113,7 +111,7 @@ def better(fits: dict[str, Fit]) -> str | None:
     Clearly nearer points decide, else the share in view, which may stay equal when a table top is turned over.
     """
     (first, a), (second, b) = fits.items()
-    if not in_view(fits):
+    if max(a.in_view, b.in_view) < LEAST_IN_VIEW:
         return None
     if a.distance > NEARER * b.distance or b.distance > NEARER * a.distance:
         return first if a.distance < b.distance else second
@@ -122,23 +120,15 @@ def better(fits: dict[str, Fit]) -> str | None:
     return None
 
 
-def in_view(fits: dict[str, Fit]) -> bool:
-    """Return True if splats are in view in some axes."""
-    return max(fit.in_view for fit in fits.values()) >= LEAST_IN_VIEW
-
-
 def likeness(gaussians: Gaussians, scene: Scene) -> float:
     """Return the mean PSNR of thumbnails of a file's Gaussians against those of photos, dB."""
     gaussians = around(gaussians, origin_of_file(gaussians, scene))
-    views = spread([*scene.train, *scene.test], MOST_THUMBNAILS)
-    return fmean(thumbnail_psnr(gaussians, view, scene.background) for view in views)
-
-
-def thumbnail_psnr(gaussians: Gaussians, view: View, background: Float[Tensor, "3"]) -> float:
-    """Return the PSNR of a small render against a small photo, dB."""
-    camera = view.camera.zoom(min(1.0, THUMBNAIL / max(view.camera.size)))
-    photo = torch.nn.functional.interpolate(view.image()[None], size=(camera.height, camera.width), mode="area")[0]
-    return psnr(render_gaussians(gaussians, camera, RasterSettings(path="eager"), background), photo)
+    levels = []
+    for view in spread([*scene.train, *scene.test], MOST_THUMBNAILS):
+        camera = view.camera.zoom(min(1.0, THUMBNAIL / max(view.camera.size)))
+        photo = torch.nn.functional.interpolate(view.image()[None], size=(camera.height, camera.width), mode="area")[0]
+        levels.append(psnr(render_gaussians(gaussians, camera, RasterSettings(path="eager"), scene.background), photo))
+    return fmean(levels)
 
 
 def more_alike(fits: dict[str, Fit]) -> str | None:

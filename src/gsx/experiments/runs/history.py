@@ -7,6 +7,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
+from itertools import chain
 from typing import Any
 
 from gsx.core.errors import InputError, command
@@ -46,8 +47,15 @@ def record_changes(run: Run, settings: Settings, plugins: Plugins, changed: bool
         write_anew(run, facts, files.problems.get(FACTS, f"{FACTS} is missing"))
         return
     before, now = circumstances(files.environment), circumstances(facts)
-    differences = {key: pair for key, pair in changes(before, now).items() if comparable(key, before, now)}
-    known = known_options(files.environment)
+    plugins_known = any(key.startswith("plugins.") for key in before)  # then one of them may be new
+    differences = {
+        key: pair
+        for key, pair in changes(before, now).items()
+        if (plugins_known if key.startswith("plugins.") else key in before and key in now)
+    }
+    # all digests of the run's options: a crash may leave config.yaml older than the history
+    pairs = [part(entry, "changed").get("options", []) for entry in files.environment.get("history", [])]
+    known = {str(digest) for digest in (files.environment.get("options"), *chain(*pairs)) if digest}
     edited = bool(known) and composition_key(files.config, "", settings.idle) not in known
     others = [other_options(files, settings, plugins, "source" in differences)] if edited else []
     if not changed:
@@ -71,19 +79,6 @@ def circumstances(facts: Mapping[str, Any]) -> dict[str, Any]:
     for entry in facts.get("history", []):
         last |= {key: now for key, (_, now) in part(entry, "changed").items()}
     return last
-
-
-def comparable(key: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Return True if an entry is known both times; a plugin may be new if plugins were recorded at all."""
-    if key.startswith("plugins."):
-        return any(other.startswith("plugins.") for other in before)
-    return key in before and key in now
-
-
-def known_options(facts: Mapping[str, Any]) -> set[str]:
-    """Return all digests of the run's options: a crash may leave config.yaml older than the history."""
-    pairs = [part(entry, "changed").get("options", []) for entry in facts.get("history", [])]
-    return {str(digest) for digest in (facts.get("options"), *(one for pair in pairs for one in pair)) if digest}
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:

@@ -23,7 +23,7 @@ def set_up_logging() -> None:
     root = logging.getLogger("gsx")
     root.setLevel(logging.INFO)
     root.propagate = False
-    root.handlers = [quiet(logging.StreamHandler(sys.stderr), Plain())] if speaks() else [logging.NullHandler()]
+    root.handlers = [tolerant(logging.StreamHandler(sys.stderr), Plain())] if speaks() else [logging.NullHandler()]
 
 
 @contextmanager
@@ -33,7 +33,7 @@ def logged_to(folder: Path) -> Iterator[None]:
         yield
         return
     file = logging.FileHandler(folder / "log.txt", encoding="utf-8", errors="backslashreplace")
-    handler = quiet(file, logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    handler = tolerant(file, logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     root = logging.getLogger("gsx")
     if root.level == logging.NOTSET:  # called from Python without set_up_logging
         root.setLevel(logging.INFO)
@@ -45,7 +45,18 @@ def logged_to(folder: Path) -> Iterator[None]:
         handler.close()
 
 
-def quiet(handler: logging.Handler, formatter: logging.Formatter) -> logging.Handler:
+@contextmanager
+def quiet(level: int = logging.INFO) -> Iterator[None]:
+    """Hold back messages up to a level inside the context."""
+    before = logging.root.manager.disable
+    logging.disable(max(before, level))
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
+def tolerant(handler: logging.Handler, formatter: logging.Formatter) -> logging.Handler:
     """Return the handler; it ignores a full disk or a closed terminal, which raise errors elsewhere."""
     handler.setFormatter(formatter)
     handler.handleError = lambda record: None  # type: ignore[method-assign]

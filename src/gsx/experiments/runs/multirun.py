@@ -71,7 +71,8 @@ def check_overrides(overrides: Sequence[str], plugins: Plugins) -> tuple[Path, l
         for place, values in enumerate(words):
             for other in values[1:]:
                 compose_raw([*first[:place], other, *first[place + 1 :]], plugins.registry)
-        return output, launcher_for(math.prod(size_of_sweep(one) for one in parsed), first)
+        sweeps = [one.sweep_string_iterator() for one in parsed if one.is_sweep_override()]
+        return output, launcher_for(math.prod(len(list(islice(one, MOST_COUNTED))) for one in sweeps), first)
 
 
 def launcher_for(jobs: int, overrides: Sequence[str]) -> list[str]:
@@ -80,11 +81,6 @@ def launcher_for(jobs: int, overrides: Sequence[str]) -> list[str]:
 
     launcher = hydra_compose("config", overrides=list(overrides), return_hydra_config=True).hydra.launcher
     return [f"hydra.launcher.n_jobs={processes_for(jobs, launcher.n_jobs)}"] if "n_jobs" in launcher else []
-
-
-def size_of_sweep(override: Any) -> int:
-    """Return the number of values of an override, up to MOST_COUNTED."""
-    return len(list(islice(override.sweep_string_iterator(), MOST_COUNTED))) if override.is_sweep_override() else 1
 
 
 def refuse_one_folder(overrides: Sequence[Any]) -> None:

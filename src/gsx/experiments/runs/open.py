@@ -7,7 +7,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from gsx.core.data.scene import Scene
 from gsx.core.errors import CheckpointError, ConfigError, InputError, command
@@ -130,7 +129,9 @@ def make_folder(
         refuse_used(settings.general.folder)  # another process may have been faster
     try:
         write_config(run.folder / "config.yaml", settings.resolved)
-        facts = environment(run, plugins, settings.idle) | ({"start": doubts} if doubts else {}) | plan_facts(settings)
+        facts = environment(run, plugins, settings.idle) | ({"start": doubts} if doubts else {})
+        if settings.time_plan:
+            facts["minutes"] = settings.time_plan | {"repeat": list(settings.repeat)}
         write_json(run.folder / "environment.json", facts)
         if settings.general.init == "warm_start":
             warm_start.adopt(run, warm_start.warm_start_folder(run, settings.idle, plugins.versions))
@@ -139,13 +140,6 @@ def make_folder(
         shutil.rmtree(run.folder, ignore_errors=True)
         raise
     return run.folder
-
-
-def plan_facts(settings: Settings) -> dict[str, Any]:
-    """Return what environment.json says of a plan by wall time; empty: there is none."""
-    if not settings.time_plan:
-        return {}
-    return {"minutes": settings.time_plan | {"repeat": list(settings.repeat)}}
 
 
 def refuse_other(folder: Path) -> None:
@@ -269,7 +263,9 @@ def resume_or_start(settings: Settings, plugins: Plugins, stamp: str, claims: Ex
     files = read_run(folder)
     if finished(files, settings.resolved, stamp, settings.idle):
         lost = f", {', '.join(files.lost)} lost since" if files.lost else ""
-        logger.info("finished earlier%s%s: %s", by_another(files), lost, folder)
+        revision = other_revision(files, this := source_revision())
+        other = f" by another revision of gsx's source ({revision}, this is {this})" if revision else ""
+        logger.info("finished earlier%s%s: %s", other, lost, folder)
         return None
     try:
         with ExitStack() as claim:
@@ -295,12 +291,6 @@ def continued(folder: Path, files: RunFiles, settings: Settings, stamp: str) -> 
     if composition_key(files.config, scene, settings.idle) != folder.name:
         raise CheckpointError(f"{folder} holds the run of another composition than its name says")
     return restored(settings, folder, training=True)
-
-
-def by_another(files: RunFiles) -> str:
-    """Name another revision of the source that trained a run; empty for this one."""
-    revision = other_revision(files, this := source_revision())
-    return f" by another revision of gsx's source ({revision}, this is {this})" if revision else ""
 
 
 def set_aside(folder: Path, reason: str) -> None:

@@ -70,16 +70,12 @@ class Orbit:
     outward: bool
     """True: look away from the axis."""
 
-    def direction(self, bearing: float) -> Float[Tensor, "3"]:
-        """Return the horizontal unit vector from the axis."""
-        return math.cos(bearing) * self.axes[0] + math.sin(bearing) * self.axes[1]
-
     def pose(self, phase: float) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
         """Return the eye and a point to look at."""
         full = self.swing >= math.pi
         bearing = self.bearing + (phase if full else self.swing * math.cos(phase))
         height = self.height + self.rise * math.sin(phase)
-        side = self.direction(bearing)
+        side = math.cos(bearing) * self.axes[0] + math.sin(bearing) * self.axes[1]
         eye = self.target + self.radius * side + height * self.axes[2]
         return eye, (eye + side if self.outward else self.target)
 

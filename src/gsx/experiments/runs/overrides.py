@@ -86,16 +86,16 @@ def plain(name: str, value: Any) -> Any:
 
 
 def with_quoted_paths(overrides: Sequence[str]) -> list[str]:
-    """Return overrides with paths such as `~/a`, or existing ones such as `a=b` or `a (1)`, quoted."""
+    """Return overrides with paths such as `~/a`, or existing ones such as `a=b` or `a (1)`, quoted.
+
+    Hydra does not read these; shells leave `~` within a word to programs.
+    """
+
+    def special(value: str) -> bool:
+        return os.path.exists(expand_home(value)) if SPECIAL.search(value) else value.startswith("~")
+
     pairs = [word.partition("=") for word in overrides]
-    return [word_of(key, value) if needs_quotes(value) else f"{key}{equals}{value}" for key, equals, value in pairs]
-
-
-def needs_quotes(value: str) -> bool:
-    """Return True for a path that Hydra does not read: shells leave `~` within a word to programs."""
-    if SPECIAL.search(value):
-        return os.path.exists(expand_home(value))
-    return value.startswith("~")
+    return [word_of(key, value) if special(value) else f"{key}{equals}{value}" for key, equals, value in pairs]
 
 
 def parse_overrides(overrides: Sequence[str]) -> list[Any]:

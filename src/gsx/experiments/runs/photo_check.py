@@ -16,7 +16,6 @@ from gsx.core.plugins import Plugins
 from gsx.core.quality.metrics import psnr
 from gsx.core.quality.sharpness import sharpness
 from gsx.core.shapes import Float
-from gsx.core.training.module import TrainingModule
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.experiments.evaluation.chosen_views import distinct
@@ -48,29 +47,20 @@ def check_photos(folder: Path, plugins: Plugins, worst: int, overrides: Sequence
 def findings_of(run: Run, pixels: int) -> list[Finding]:
     """Return findings on every training photo, worst first."""
     views = distinct(run.train_views)
-    progress, known = Countdown("checking photos", len(views)), sharpness_of(run.scene.train)
-    findings = []
+    progress, findings = Countdown("checking photos", len(views)), []
+    files = {view.name: view.source.path for view in run.scene.train if isinstance(view.source, PhotoSource)}
+    ratios = sharpness(sorted(set(files.values())))
+    known = {name: ratios[path] for name, path in files.items() if path in ratios}
     for view in views:
         findings.append(finding(run, view, known.get(view.name), pixels))
         progress.advance(1, view.name)
     exposure, poses = run.modules.get("exposure"), run.modules.get("poses")
     when = "never" if exposure is None else exposure.options.when
-    remarks = remarks_on(findings, when, is_active(exposure), is_active(poses))
+    exposed, posed = (isinstance(module, Correction) and module.active for module in (exposure, poses))
+    remarks = remarks_on(findings, when, exposed, posed)
     return sorted(
         (replace(one, remarks=words) for one, words in zip(findings, remarks, strict=True)), key=lambda one: one.psnr
     )
-
-
-def is_active(module: TrainingModule | None) -> bool:
-    """Return True for a module that corrects photos now."""
-    return isinstance(module, Correction) and module.active
-
-
-def sharpness_of(views: Sequence[View]) -> dict[str, float]:
-    """Return the sharpness of photos relative to their neighbours, by view."""
-    files = {view.name: view.source.path for view in views if isinstance(view.source, PhotoSource)}
-    ratios = sharpness(sorted(set(files.values())))
-    return {name: ratios[path] for name, path in files.items() if path in ratios}
 
 
 @torch.no_grad()

@@ -1,6 +1,6 @@
 """Named protocols, conf/protocol: how a paper or program prepares scenes and measures."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,11 +29,6 @@ class NamedProtocol:
     values: dict[str, Any]
     """Values by dotted key."""
 
-    def fits(self, scene: str) -> bool:
-        """Returns whether it is for a scene of that name; one for a folder of a release fits no other."""
-        alike = {self.scene, scene} <= {*WITH_POSES} and "scene.images" not in self.values
-        return self.scene in ("", scene) or alike
-
     @property
     def measuring(self) -> dict[str, Any]:
         """Returns the values that fit any pictures: of `eval` and `metrics`, and the truth's filter."""
@@ -45,8 +40,9 @@ class NamedProtocol:
         return {key: value for key, value in self.values.items() if key not in self.measuring}
 
     def refuse(self, scene: str) -> None:
-        """Raises ConfigError if it does not fit a scene."""
-        if not self.fits(scene):
+        """Raises ConfigError if it is for other scenes; one for a folder of a release fits no other."""
+        alike = {self.scene, scene} <= {*WITH_POSES} and "scene.images" not in self.values
+        if self.scene not in ("", scene) and not alike:
             raise ConfigError(f"protocol={self.name} is for scene={self.scene}, not for scene={scene}: {REMEDY}")
 
     def refuse_run(self, config: DictConfig, place: str) -> None:
@@ -61,8 +57,13 @@ class NamedProtocol:
 
 
 def named_protocol(name: str) -> NamedProtocol:
-    """Reads a protocol, inside a session of Hydra."""
-    content = content_of(name)
+    """Reads a protocol of gsx or of a plugin, inside a session of Hydra."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    place = f"{GROUP}/{name}"
+    sources = GlobalHydra.instance().config_loader().get_sources()
+    config = next(source.load_config(place).config for source in sources if source.is_config(place))
+    content: dict[str, Any] = dict(OmegaConf.to_container(config, resolve=False))  # type: ignore[arg-type]
     values: dict[str, Any] = {}
     scene = ""
     for entry in content.pop("defaults", []):
@@ -74,24 +75,8 @@ def named_protocol(name: str) -> NamedProtocol:
     return NamedProtocol(name=name, scene=scene, values=values | flattened(content))
 
 
-def content_of(name: str) -> dict[str, Any]:
-    """Returns the content of a protocol's file, of gsx or of a plugin."""
-    from hydra.core.global_hydra import GlobalHydra
-
-    place = f"{GROUP}/{name}"
-    sources = GlobalHydra.instance().config_loader().get_sources()
-    config = next(source.load_config(place).config for source in sources if source.is_config(place))
-    return dict(OmegaConf.to_container(config, resolve=False))  # type: ignore[arg-type]
-
-
-def chosen_protocols(overrides: Sequence[str]) -> Iterator[NamedProtocol]:
-    """Yields the protocols that overrides choose."""
-    for override in parse_overrides([word for word in overrides if key_of(word) == GROUP]):
-        if override.key_or_group == GROUP:
-            yield named_protocol(str(override.value()))
-
-
 def refuse_other_scene(overrides: Sequence[str], config: DictConfig) -> None:
     """Raises ConfigError if overrides choose a protocol that does not fit the scene of their composition."""
-    for protocol in chosen_protocols(overrides):
-        protocol.refuse(str(OmegaConf.select(config, "scene.name")))
+    for override in parse_overrides([word for word in overrides if key_of(word) == GROUP]):
+        if override.key_or_group == GROUP:
+            named_protocol(str(override.value())).refuse(str(OmegaConf.select(config, "scene.name")))

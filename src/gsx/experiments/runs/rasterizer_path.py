@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from gsx.core.errors import first_line
+from gsx.core.errors import CompilerError, first_line
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 from gsx.core.rasterizer.compositor import Restricted
@@ -54,6 +54,23 @@ def warm(run: Run, helped: bool = True) -> None:
     seconds = compile_ahead(rules_of_step(run.backbone, run.raster), run.device, helped, lambda: run.progress.stopping)
     if not run.progress.stopping:
         logger.info("compiled in %.0f s", seconds)
+
+
+def warm_or_eager(run: Run, path: str) -> bool:
+    """Compile what steps need; return True if that failed at the start of a run, which then draws by the eager path.
+
+    Raises:
+        CompilerError: it failed, and `path`, that of the settings, is not auto, or the run is at a later step.
+    """
+    try:
+        warm(run)
+    except CompilerError as error:
+        if path != "auto" or run.step > 0 or run.ranks.size > 1:
+            raise
+        logger.warning("%s; using the eager path, which is several times slower", error)
+        run.raster = run.backbone.raster = replace(run.raster, path="eager")
+        return True
+    return False
 
 
 def compile_in_background(

@@ -54,7 +54,9 @@ def read_config(path: Path, plugins: Plugins, overrides: Sequence[str] = (), spa
             raise ConfigError(f"'{override}' has no value: write {override}=VALUE")
         known = list(dict.fromkeys([*dotted(OmegaConf.to_container(config)), *newer_keys(config, plugins)]))
         if key == COMPETITOR_GROUP:
-            OmegaConf.update(config, COMPETITOR, composed_competitor(override, plugins), merge=False, force_add=True)
+            with Compositions(plugins) as compositions:
+                upscaler = compositions.node([override], COMPETITOR)
+            OmegaConf.update(config, COMPETITOR, upscaler, merge=False, force_add=True)
             continue
         if key not in known:
             raise ConfigError(unknown_key(key, known, f" for {path}", " That file lists all keys."))
@@ -83,17 +85,20 @@ def with_protocols(overrides: Sequence[str], config: DictConfig, plugins: Plugin
 def absent_nodes(config: DictConfig, plugins: Plugins) -> dict[str, tuple[str, str]]:
     """Return (kind, name) of the components that no plugin provides, by dotted key."""
     values: Any = OmegaConf.to_container(config)
+    named, options = component_names(values), {entry.name for entry in dataclasses.fields(TrainingOptions)}
+    modules = [name for name, node in part(values, "training").items() if isinstance(node, dict)]
+    named |= {f"training.{name}": ("module", name) for name in modules if name not in options}
+    return {key: one for key, one in named.items() if one not in plugins.registry.components}
+
+
+def component_names(values: dict[str, Any]) -> dict[str, tuple[str, str]]:
+    """Return (kind, name) of the components that a configuration names, by dotted key; modules are not named."""
     nodes = {kind: (kind, part(values, kind)) for kind in COMPONENT_KINDS if part(values, kind)}
     for kind in SEVERAL:
         nodes |= {f"{kind}.{name}": (kind, node) for name, node in part(values, kind).items() if isinstance(node, dict)}
     if upscaler := part(part(values, "eval"), "competitor"):
         nodes[COMPETITOR] = ("regenerator", upscaler)
-    options = {entry.name for entry in dataclasses.fields(TrainingOptions)}
-    for name, node in part(values, "training").items():
-        if isinstance(node, dict) and name not in options:
-            nodes[f"training.{name}"] = ("module", {"name": name})
-    named = {key: (kind, str(node.get("name", ""))) for key, (kind, node) in nodes.items()}
-    return {key: one for key, one in named.items() if one not in plugins.registry.components}
+    return {key: (kind, str(node.get("name", ""))) for key, (kind, node) in nodes.items()}
 
 
 def settings_without(
@@ -126,12 +131,6 @@ def plugin_remedy(folder: Path, plugins: Plugins) -> str:
     )
 
 
-def composed_competitor(override: str, plugins: Plugins) -> dict[str, Any]:
-    """Return the upscaler that a choice of the command line names, as a new run would have it."""
-    with Compositions(plugins) as compositions:
-        return compositions.node([override], COMPETITOR)
-
-
 def saved_config(path: Path) -> DictConfig:
     """Read a configuration by today's names.
 
@@ -156,17 +155,11 @@ def newer_keys(config: DictConfig, plugins: Plugins) -> Iterator[str]:
     values: Any = OmegaConf.to_container(config)
     schemas: dict[str, type] = {"training": TrainingOptions, "eval": EvalOptions, "metrics.lpips": LpipsOptions}
     schemas |= {f"training.{name}": one.options for name, one in plugins.registry.of("module").items()}
-    nodes = {kind: (kind, part(values, kind)) for kind in COMPONENT_KINDS}
-    for kind in SEVERAL:
-        nodes |= {f"{kind}.{name}": (kind, node) for name, node in part(values, kind).items() if isinstance(node, dict)}
     registered = plugins.registry.components
-    components = {key: registered.get((kind, str(node.get("name", "")))) for key, (kind, node) in nodes.items()}
+    components = {key: registered.get(named) for key, named in component_names(values).items()}
     schemas |= {key: component.options for key, component in components.items() if component}
     yield from schema_keys(GeneralOptions)
     yield COMPETITOR
-    upscaler = part(part(values, "eval"), "competitor")
-    if component := registered.get(("regenerator", str(upscaler.get("name", "")))):
-        yield from schema_keys(component.options, f"{COMPETITOR}.")
     for key, schema in schemas.items():
         yield from (name for name in schema_keys(schema, f"{key}.") if not name.startswith(("eval.lpips", "eval.perc")))
     yield from ("metrics.perceptual", "metrics.perceptual_pixels")

@@ -157,6 +157,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
     if budget is not None:
         typed(Budget, budget, "budget")
     checks = {role: typed(Checks, node, f"checks.{role}") for role, node in nodes["checks"].items()}
+    strict = typed(Checks, OmegaConf.to_container(strict_node()), "checks")
     if all(isinstance(one.options, WithChecks) for one in several["augmenter"].values()):
         raw.pop("checks", None)  # nothing uses them
     return Settings(
@@ -172,7 +173,7 @@ def settings_from(config: DictConfig | dict[str, Any], plugins: Plugins) -> Sett
         regenerators=several["regenerator"],
         dataset=typed(Dataset, dataset, "dataset") if dataset else None,
         trackers=several["tracker"],
-        checks={role: checks.get(role) or strict_checks() for role in several["regenerator"]},
+        checks={role: checks.get(role) or strict for role in several["regenerator"]},
         resolved={key: value for key, value in raw.items() if key != "experiment"},
         idle=idle_keys(
             {"training": TrainingOptions}
@@ -300,14 +301,9 @@ def named_code(settings: Settings) -> dict[str, str]:
 
 
 def strict_node() -> Any:
-    """Load conf/checks/strict.yaml."""
+    """Load conf/checks/strict.yaml, the default: the checks of regenerators that promise consistency."""
     with as_file(files("gsx.conf").joinpath("checks", "strict.yaml")) as path:
         return OmegaConf.load(path)
-
-
-def strict_checks() -> Checks:
-    """Return the checks of regenerators that promise consistency, which are the default."""
-    return typed(Checks, OmegaConf.to_container(strict_node()), "checks")
 
 
 class Compositors(Mapping[str, Compositor]):
@@ -339,3 +335,11 @@ def with_compositors(options: RasterOptions, plugins: Plugins) -> RasterSettings
         return RasterSettings(**vars(options), compositors=Compositors(plugins.registry.of("compositor")))
     except ValueError as error:
         raise ConfigError(str(error)) from error
+
+
+def overridden(settings: Settings, changes: Mapping[str, object], plugins: Plugins) -> Settings:
+    """Return settings with other values by dotted key; raise ConfigError as `settings_from`."""
+    config = OmegaConf.create(settings.resolved)
+    for key, value in changes.items():
+        OmegaConf.update(config, key, value, force_add=True)
+    return settings_from(config, plugins)

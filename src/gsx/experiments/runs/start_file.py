@@ -76,15 +76,15 @@ def in_scene(gaussians: Gaussians, scene: Scene) -> Gaussians:
 
 
 def origin_of_file(gaussians: Gaussians, scene: Scene) -> Origin:
-    """Return the offset to subtract from a file's positions: the scene's origin, or 0 if it was subtracted before."""
-    lies_there = any(scene.origin) and lies_around_zero(gaussians.means, scene.origin)
-    return NO_ORIGIN if lies_there else scene.origin
+    """Return the offset to subtract from a file's positions: the scene's origin, or 0 if it was subtracted before.
 
-
-def lies_around_zero(positions: Float[Tensor, "P 3"], origin: Origin) -> bool:
-    """Return True if most positions are nearer to (0, 0, 0) than to an origin."""
-    offsets = positions - torch.tensor(origin, dtype=torch.float64)
-    return float((positions.norm(dim=1) < offsets.norm(dim=1)).double().mean()) > 0.5
+    It was if most positions are nearer to (0, 0, 0) than to the origin.
+    """
+    if not any(scene.origin):
+        return scene.origin
+    offsets = gaussians.means - torch.tensor(scene.origin, dtype=torch.float64)
+    nearer = (gaussians.means.norm(dim=1) < offsets.norm(dim=1)).double()
+    return NO_ORIGIN if float(nearer.mean()) > 0.5 else scene.origin
 
 
 def start_doubts(settings: Settings, scene: Scene, start: Gaussians | None) -> list[str]:

@@ -3,11 +3,11 @@
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from gsx.core.errors import CheckpointError, InputError
 from gsx.core.plugins import Plugins
-from gsx.core.rasterizer import RasterSettings
 from gsx.engine.threads import watch_cores
 from gsx.experiments.run_folder import checkpoint
 from gsx.experiments.run_folder.files import read_run, state_of
@@ -31,7 +31,7 @@ class WatchedRun:
         self.run, self.settings = open_run(folder, plugins)
         raster = self.run.raster
         self.run.raster = replace(raster, path="eager")  # the first pictures do not wait for a compiler
-        self.compiling = compile_in_background(raster, self.run.device, self.use)
+        self.compiling = compile_in_background(raster, self.run.device, partial(setattr, self.run, "raster"))
         self.checked = time.monotonic()
 
     def refresh(self) -> bool:
@@ -48,10 +48,6 @@ class WatchedRun:
             return False
         self.run.progress.curves = read_curves(self.run.folder)
         return True
-
-    def use(self, raster: RasterSettings) -> None:
-        """Render by these settings from now on."""
-        self.run.raster = raster
 
     def state(self) -> str:
         """Return the state of the run in words."""

@@ -14,6 +14,7 @@ from gsx.core.errors import ConfigError, nearest
 from gsx.core.ranges import LARGEST_SEED, Range
 from gsx.core.training.augmenter import KnownStart
 from gsx.engine.cache import content_key
+from gsx.experiments.reports.page import counted
 from gsx.experiments.run_folder.files import read_run
 from gsx.experiments.run_folder.run_key import finished, place_of, scene_stamp, sorted_items, trained
 from gsx.experiments.runs.settings import Settings
@@ -210,10 +211,8 @@ def plan_lines(plan: Plan) -> list[str]:
     runs = sum(map(len, plan.phases))
     rows, seeds = len(plan.experiment.chosen), len(plan.experiment.seeds)
     scenes = len({(cell.dataset, cell.scene) for cell in plan.cells})
-    lines = [
-        f"{plan.experiment.title}: {rows} rows, {scenes} {'scene' if scenes == 1 else 'scenes'}, {seeds} "
-        f"{'seed' if seeds == 1 else 'seeds'}: {plan.done} runs finished, {runs} to train"
-    ]
+    size = f"{rows} rows, {counted(scenes, 'scene')}, {counted(seeds, 'seed')}"
+    lines = [f"{plan.experiment.title}: {size}: {plan.done} runs finished, {runs} to train"]
     if plan.shared:
         lines.append(f"common beginnings are trained once: {plan.shared:,} of {plan.steps:,} steps are saved")
     return lines

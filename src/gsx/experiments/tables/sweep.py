@@ -1,7 +1,7 @@
 """A table from its command line to its files: plans it, runs what is missing, gathers and writes."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,8 @@ from gsx.core.plugins import Plugins
 from gsx.engine.cache import content_key, in_use
 from gsx.experiments.reports.overview import write_overview
 from gsx.experiments.run_folder.claims import claimed_name, left_behind
-from gsx.experiments.run_folder.files import reported
-from gsx.experiments.run_folder.run_key import sorted_items
+from gsx.experiments.run_folder.files import part, reported
+from gsx.experiments.run_folder.run_key import NAMES, WHERE, comparable, sorted_items, used_regenerators, without
 from gsx.experiments.runs.compose import Compositions
 from gsx.experiments.runs.job import finish_leftovers
 from gsx.experiments.runs.multirun import launch_jobs
@@ -21,7 +21,6 @@ from gsx.experiments.runs.overrides import key_of, parse_overrides, refuse_absen
 from gsx.experiments.runs.typed import typed
 from gsx.experiments.tables.datasets import missing
 from gsx.experiments.tables.plan import Cell, Experiment, Plan, cells_of, check_scenes, plan_lines, planned, words_of
-from gsx.experiments.tables.protocol_differences import protocol_differences
 from gsx.experiments.tables.published import read_table
 from gsx.experiments.tables.table import Table, table_of
 from gsx.experiments.tables.table_text import as_csv, as_latex, as_markdown, as_text
@@ -74,7 +73,6 @@ def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], A
     common = [word for word in overrides if key_of(word) not in OWN or is_below_dataset(word)]
     launching = [word for word in overrides if key_of(word) == "hydra"]
     with in_use(), Compositions(plugins) as compositions:  # its runs begin with states of each other
-        refuse_sweeps(common)
         refuse_overrides(common)
         chosen = [word for word in overrides if key_of(word) == "experiment"]
         experiment = experiment_of([*chosen, *launching], compositions)
@@ -85,7 +83,9 @@ def run_table(overrides: Sequence[str], plugins: Plugins, job: Callable[[Any], A
         plain = experiment_of([word for word in chosen if is_table([word])], compositions)
         foreign = protocol_of(plain, cells, compositions)
         published = read_table(experiment.published) if experiment.published else None
-        lacking = lacking_of(cells, datasets)
+        places = {(cell.dataset, cell.scene): Path(cell.settings.general.data_root) for cell in cells}
+        reasons = {(name, scene): missing(datasets[name], scene, root) for (name, scene), root in places.items()}
+        lacking = {place: reason for place, reason in reasons.items() if reason}
         due = [cell for cell in cells if (cell.dataset, cell.scene) not in lacking]
         plan = planned(experiment, datasets, due, together=any("launcher=" in word for word in launching))
         folder = folder_of(plan, plain, cells[0].config, common)
@@ -159,20 +159,16 @@ def fitting_words(
 
 
 def refuse_overrides(overrides: Sequence[str]) -> None:
-    """Raises ConfigError for overrides that a table sets for each run."""
+    """Raises ConfigError for overrides that a table sets for each run, or has rows, scenes and seeds for."""
+    for override in parse_overrides(overrides):
+        if override.is_sweep_override():
+            remedy = "experiment.seeds=[0,1,2]" if override.key_or_group == "seed" else "another table"
+            raise ConfigError(f"'{override.input_line}' asks for several values, which a table does not take: {remedy}")
     for word in overrides:
         key = word.lstrip("+~").partition("=")[0]
         if key in TAKEN or word.startswith("~dataset"):
             remedy = TAKEN.get(key, "experiment.scenes=[NAME,...] chooses scenes")
             raise ConfigError(f"'{word}' is not for tables, whose runs have it of their own: {remedy}")
-
-
-def refuse_sweeps(overrides: Sequence[str]) -> None:
-    """Raises ConfigError for overrides with several values: a table has rows, scenes and seeds for that."""
-    for override in parse_overrides(overrides):
-        if override.is_sweep_override():
-            remedy = "experiment.seeds=[0,1,2]" if override.key_or_group == "seed" else "another table"
-            raise ConfigError(f"'{override.input_line}' asks for several values, which a table does not take: {remedy}")
 
 
 def datasets_of(experiment: Experiment, overrides: Sequence[str], compositions: Compositions) -> dict[str, Any]:
@@ -195,13 +191,6 @@ def protocol_of(experiment: Experiment, cells: Sequence[Cell], compositions: Com
         return compositions.settings([f"dataset={name}", *words, *experiment.overrides]).resolved
 
     return added + protocol_differences([(cell.config, published(cell), cell.settings.idle) for cell in of_rows])
-
-
-def lacking_of(cells: Sequence[Cell], datasets: dict[str, Any]) -> dict[tuple[str, str], str]:
-    """Returns reasons why scenes cannot be trained, by dataset and scene."""
-    places = {(cell.dataset, cell.scene): Path(cell.settings.general.data_root) for cell in cells}
-    reasons = {(name, scene): missing(datasets[name], scene, root) for (name, scene), root in places.items()}
-    return {place: reason for place, reason in reasons.items() if reason}
 
 
 def folder_of(plan: Plan, plain: Experiment, config: dict[str, Any], common: Sequence[str]) -> Path:
@@ -228,3 +217,53 @@ def write_table(table: Table, folder: Path, runs: Sequence[Path]) -> None:
         replace_text(folder / name, text)
     if runs:
         write_overview(folder, list(dict.fromkeys(runs)))
+
+
+PLACES = ("model", "revision", "variant", "dtype", "tiling")
+"""Keys of regenerators that say where a model comes from and how it fits into memory."""
+LISTED_KEYS = 12
+"""Differences from the paper's protocol that are listed."""
+
+
+def protocol_differences(compared: Sequence[tuple[dict[str, Any], dict[str, Any], frozenset[str]]]) -> list[str]:
+    """Lists the keys in which compositions differ, with both values, those of most rows first.
+
+    `compared`: (as run, as published, keys without effect) of each row.
+    """
+    found: dict[str, list[tuple[str, str]]] = {}
+    for own, paper, idle in compared:
+        for key, value, published in differing(own, paper, idle):
+            found.setdefault(key, []).append((value, published))
+    lines = []
+    for key in sorted(found, key=lambda key: -len(found[key])):
+        ours, theirs = (", ".join(dict.fromkeys(values)) for values in zip(*found[key], strict=True))
+        lines.append(f"{key}={ours} (paper: {theirs})")
+    more = [f"and {len(lines) - LISTED_KEYS} more"] if len(lines) > LISTED_KEYS else []
+    return lines[:LISTED_KEYS] + more
+
+
+def differing(own: dict[str, Any], paper: dict[str, Any], idle: frozenset[str]) -> Iterator[tuple[str, str, str]]:
+    """Yields keys whose values differ, with ours and the paper's; of another component only its name."""
+    mine, theirs = (comparable(protocol_settings(config, idle)) for config in (own, paper))
+    others = {key.removesuffix(".name") for key in mine if key.endswith(".name") and mine[key] != theirs.get(key)}
+    for key in dict.fromkeys([*mine, *theirs]):
+        inside = any(key.startswith(f"{other}.") and key != f"{other}.name" for other in others)
+        if mine.get(key) != theirs.get(key) and not inside:
+            yield key, str(mine.get(key, "absent")), str(theirs.get(key, "absent"))
+
+
+def protocol_settings(config: dict[str, Any], idle: frozenset[str]) -> dict[str, Any]:
+    """Returns the protocol of a composition: all but where it runs, its seed and its zooms."""
+    known = without(config, idle)
+    kept = {key: value for key, value in known.items() if key not in (*WHERE, *NAMES, "seed")}
+    kept["dataset"] = part(known, "dataset").get("title")
+    kept["eval"] = without(part(known, "eval"), ("zoom", "tile_pixels"))
+    kept["metrics"] = {key: part(part(known, "metrics"), "lpips").get(key) for key in ("net", "input_range")}
+    return kept | {"regenerator": placeless(used_regenerators(known))}
+
+
+def placeless(node: Any) -> Any:
+    """Removes from regenerators where their models come from and how they fit into memory."""
+    if not isinstance(node, dict):
+        return node
+    return {key: placeless(value) for key, value in node.items() if key not in PLACES}

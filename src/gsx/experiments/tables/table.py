@@ -32,7 +32,7 @@ MEASURES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "PSNR": lambda e: e.get("psnr"),
     "SSIM": lambda e: e.get("ssim"),
     "LPIPS": lambda e: e.get("lpips"),
-    "kGS": lambda e: thousandth(e.get("visible_primitives")),
+    "kGS": lambda e: e["visible_primitives"] / 1000 if is_number(e.get("visible_primitives")) else None,
     "MB": lambda e: e.get("megabytes"),
     "s": lambda e: e.get("train_seconds"),
 }
@@ -45,11 +45,6 @@ ZOOM_MEASURES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "detail": detail_share,
 }
 """By the name of `NAME xK`, from the figures at a zoom; detail: explained, above the training Nyquist frequency."""
-
-
-def thousandth(value: Any) -> float | None:
-    """Divides a number by a thousand."""
-    return value / 1000 if is_number(value) else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,15 +294,10 @@ def with_gains(figures: Sequence[Figure], baseline: str) -> list[Figure]:
         same = b is not None and f.whole == b.whole
         ours = gain(f, f.ours, b.ours) if b and same else None
         theirs = gain(f, f.paper, b.paper) if b else None
-        varied = paired_spread(f, b) if b and ours is not None else None
+        gains = [value - other for value, other in zip(f.by_seed, b.by_seed, strict=True)] if b and same else []
+        varied = spread(gains) if ours is not None and len(gains) > 1 else None
         out.append(replace(f, gain=ours, gain_spread=varied, paper_gain=theirs))
     return out
-
-
-def paired_spread(figure: Figure, base: Figure) -> float | None:
-    """Returns half of the range of a gain over the seeds; None with a single one."""
-    gains = [value - other for value, other in zip(figure.by_seed, base.by_seed, strict=True)]
-    return spread(gains) if len(gains) > 1 else None
 
 
 def seconds_of(files: RunFiles) -> float:
@@ -350,17 +340,15 @@ def notes_of(
     same = [" and ".join(rows) for rows in shared.values() if len(rows) > 1]
     notes += dict.fromkeys(f"{rows} are the same composition here" for rows in same)
     notes += of_other_revisions(cells, files)
-    notes += dict.fromkeys(f"{cell.scene}: {note}" for cell in cells for note in scene_notes(files[cell.folder]))
+    of_scenes: dict[str, None] = {}
+    for cell in cells:
+        listed = part(files[cell.folder].environment, "scene").get("notes")
+        of_scenes |= dict.fromkeys(f"{cell.scene}: {note}" for note in (listed if isinstance(listed, list) else []))
+    notes += of_scenes
     devices = {str(run.environment.get("device")) for run in files.values() if run.environment}
     if len(devices) > 1:
         notes.append(f"these runs were trained on different devices: {', '.join(sorted(devices))}")
     return notes
-
-
-def scene_notes(files: RunFiles) -> list[str]:
-    """Lists the notes of loading a run's scene: absent images, above all."""
-    notes = part(files.environment, "scene").get("notes")
-    return [str(note) for note in notes] if isinstance(notes, list) else []
 
 
 def of_other_revisions(cells: Sequence[Cell], files: dict[Path, RunFiles]) -> list[str]:

@@ -14,15 +14,11 @@ FIELDS = (
 )  # fmt: skip
 
 
-def digits(metric: str) -> int:
-    """Returns the decimals of a metric, as the paper prints it."""
-    name = metric.partition(" x")[0]
-    return DIGITS.get(name, 3 if name in PERCEPTUAL else 2)
-
-
 def number(value: float | None, metric: str, sign: bool = False) -> str:
-    """Formats a figure, if there is one; with a sign where it is a difference."""
-    return "" if value is None else f"{value:{'+' if sign else ''}.{digits(metric)}f}"
+    """Formats a figure, if there is one, with the paper's decimals; with a sign where it is a difference."""
+    name = metric.partition(" x")[0]
+    digits = DIGITS.get(name, 3 if name in PERCEPTUAL else 2)
+    return "" if value is None else f"{value:{'+' if sign else ''}.{digits}f}"
 
 
 def ours(figure: Figure) -> str:
@@ -34,12 +30,6 @@ def ours(figure: Figure) -> str:
         text += f" ± {number(figure.spread, figure.metric)}"
     text += " *" if figure.remarks else ""
     return text if figure.scenes == figure.of_scenes else f"({text}: {figure.scenes} of {figure.of_scenes})"
-
-
-def gained(figure: Figure) -> str:
-    """Formats the gain over the baseline, ± its spread."""
-    varied = number(figure.gain_spread, figure.metric)
-    return number(figure.gain, figure.metric, sign=True) + (f" ± {varied}" if varied else "")
 
 
 def headings(table: Table, scope: Scope) -> list[tuple[str, str]]:
@@ -76,7 +66,9 @@ def cells(table: Table, scope: Scope) -> list[list[str]]:
             line.append(ours(f) if what == "ours" else values[what])
         if lead:
             f = table.at(row, scope.title, lead)
-            line += [gained(f), number(f.paper_gain, lead, sign=True)]
+            varied = number(f.gain_spread, lead)
+            gain = number(f.gain, lead, sign=True) + (f" ± {varied}" if varied else "")
+            line += [gain, number(f.paper_gain, lead, sign=True)]
         rows.append(line)
     return [[*head, *gains], *rows]
 

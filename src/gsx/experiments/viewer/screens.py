@@ -93,16 +93,13 @@ class FrameServer:
             return []
         full = min(screen.pose.width, LARGEST, max(1, LARGEST * screen.pose.width // screen.pose.height))
         if screen.drawn != (screen.pose, screen.look, self.version):
-            return [(0, min(full, self.quick_width(screen.pose)))]
+            pixels = FAST / self.seconds_per_pixel
+            quick = int((pixels * screen.pose.width / screen.pose.height) ** 0.5)
+            return [(0, min(full, max(SMALLEST, min(LARGEST, quick))))]
         if screen.width < full and time.monotonic() - screen.changed_at > REST:
             finer = round(FINER * screen.width)
             return [(1, finer if FINER * finer < full else full)]
         return []
-
-    def quick_width(self, pose: Pose) -> int:
-        """Returns the width at which a picture takes about FAST seconds."""
-        pixels = FAST / self.seconds_per_pixel
-        return max(SMALLEST, min(LARGEST, int((pixels * pose.width / pose.height) ** 0.5)))
 
     def draw(self, screen: Screen, width: int) -> None:
         """Draws and sends one picture, and updates the estimate of its time."""

@@ -27,7 +27,6 @@ from gsx.experiments.viewer.camera_path import CameraPath, Keyframe, write_camer
 from gsx.experiments.viewer.pictures import COMPARED_WITH, FILTERS, Model, Pose, RunModel, picture
 from gsx.experiments.viewer.screens import FrameServer, Screen
 from gsx.experiments.viewer.up_direction import upright
-from gsx.formats.origin import Origin
 
 logger = logging.getLogger(__name__)
 
@@ -188,7 +187,7 @@ class Panel:
         origin, pose = self.viewer.frames.model.origin, self.screen.pose
         if pose is None or not any(origin):
             return ""
-        return f"  \nat {', '.join(f'{value:.3f}' for value in in_file(pose.position, origin))}"
+        return f"  \nat {', '.join(f'{value + by:.3f}' for value, by in zip(pose.position, origin, strict=True))}"
 
     def begin(self) -> None:
         """Starts at the first test view, or in front of the splats."""
@@ -241,14 +240,10 @@ class Panel:
         if not arrived and time.monotonic() < self.patience:
             return True
         self.patience = 0.0
-        self.looks_from(name if arrived else "")
+        if self.screen.look.view != (name if arrived else ""):
+            self.choose(view=name if arrived else "")
+            self.view.value = name if arrived else "-"
         return False
-
-    def looks_from(self, name: str) -> None:
-        """Notes the view that the browser's camera is at; "": none."""
-        if self.screen.look.view != name:
-            self.choose(view=name)
-            self.view.value = name or "-"
 
     def show_cameras(self, visible: bool) -> None:
         """Shows the frusta of all cameras, or hides them."""
@@ -265,8 +260,8 @@ class Panel:
         frames, pose = self.viewer.keyframes, self.screen.pose
         at = frames[-1].time + KEYFRAME_SECONDS if frames else 0.0
         fov = 2 * math.atan(math.tan(pose.fov / 2) / self.screen.look.zoom)
-        position = in_file(pose.position, self.viewer.frames.model.origin)
-        frames.append(Keyframe(time=at, position=position, wxyz=pose.wxyz, fov=fov))
+        x, y, z = (v + by for v, by in zip(pose.position, self.viewer.frames.model.origin, strict=True))
+        frames.append(Keyframe(time=at, position=(x, y, z), wxyz=pose.wxyz, fov=fov))
         self.notify("keyframe", f"{len(frames)} so far; the path takes {at:g} s")
 
     def saving(self, save: Callable[[], None]) -> None:
@@ -327,12 +322,6 @@ def pose_of(view: View, width: int) -> Pose:
     fov = 2 * float(np.arctan(camera.height / (2 * camera.fy)))
     height = max(1, round(width * camera.height / camera.width))
     return Pose(tuple(camera.centre.tolist()), tuple(wxyz.tolist()), fov, width, height)
-
-
-def in_file(position: tuple[float, float, float], origin: Origin) -> tuple[float, float, float]:
-    """Converts a position of the browser to the coordinates of the model's files."""
-    x, y, z = (value + by for value, by in zip(position, origin, strict=True))
-    return x, y, z
 
 
 def free(folder: Path, stem: str, suffix: str) -> Path:

@@ -1,9 +1,11 @@
-"""Weights of perceptual metrics in installed packages and in torch's cache, as conf/perceptual.yaml lists them.
+"""Weights of networks in local files, as `torch.save` writes state dicts, and in installed packages.
 
-Packages are located, not imported: some import what they do not need.
+conf/perceptual.yaml lists the latter. Packages are located, not imported: some import what they do not need. No code in
+files is run.
 """
 
 import hashlib
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -17,7 +19,12 @@ import yaml
 from torch import Tensor
 
 from gsx.core.errors import InputError
-from gsx.experiments.evaluation.weight_files import read_weights
+from gsx.core.files import LFS_POINTER, expand_home
+
+SAVED = (b"PK\x03\x04", b"\x80")
+"""First bytes of what `torch.save` writes: a ZIP archive, or a pickle as before torch 1.6."""
+OTHERS = ((LFS_POINTER, "a Git LFS pointer (`git lfs pull` fetches the file)"), (b"<", "a web page"))
+"""First bytes of files that are often in the place of weights."""
 
 
 class MetricUnavailable(Exception):
@@ -73,15 +80,13 @@ def locate(place: Mapping[str, Any]) -> tuple[Path, str]:
     Raises:
         FileNotFoundError: it is not on this machine.
     """
-    path, owner = in_hub(place["hub"]) if "hub" in place else in_package(place["package"], place["path"])
+    if "hub" in place:
+        path, owner = Path(torch.hub.get_dir()) / "checkpoints" / place["hub"], "torch's hub cache"
+    else:
+        path, owner = in_package(place["package"], place["path"])
     if not path.is_file():
         raise FileNotFoundError(f"{owner} has no file {path}")
     return path, f"{owner}, {path.name}, sha256 {place['sha256']}"
-
-
-def in_hub(name: str) -> tuple[Path, str]:
-    """Returns the place of a file in torch's cache of downloads."""
-    return Path(torch.hub.get_dir()) / "checkpoints" / name, "torch's hub cache"
 
 
 def in_package(package: str, inner: str) -> tuple[Path, str]:
@@ -108,3 +113,52 @@ def read_known(path: Path, sha256: str, option: str) -> dict[str, Tensor]:
     if not digest.startswith(sha256):
         raise InputError(f"{path} has sha256 {digest[:16]} instead of {sha256[:16]}")
     return read_weights(str(path), option)[0]
+
+
+def read_weights(path: str, option: str) -> tuple[dict[str, Tensor], str]:
+    """Returns the tensors of a weights file by name, and a prefix of its sha256.
+
+    Raises:
+        InputError: the file is missing or holds no state dict; the message begins with `option`.
+    """
+    try:
+        data = expand_home(path).read_bytes()
+        weights = state_dict(data)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(
+            f"{option}={path} cannot be read as weights ({reason}): give a local .pth file with a state dict"
+        ) from None
+    dense = {
+        name: value
+        for name, value in weights.items()
+        if isinstance(value, Tensor) and value.layout is torch.strided and value.device.type == "cpu"
+    }
+    usable = {name: one for name, one in dense.items() if one.is_floating_point() and bool(one.isfinite().all())}
+    return usable, hashlib.sha256(data).hexdigest()[:8]
+
+
+def state_dict(data: bytes) -> dict[str, Tensor]:
+    """Decodes a state dict.
+
+    Raises:
+        ValueError: the bytes are none.
+    """
+    if not data.startswith(SAVED):
+        raise ValueError(f"it is {kind_of(data)}")
+    try:
+        weights = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises half a dozen kinds, and advises to run what the file holds
+        raise ValueError("it is damaged, or holds other things than tensors") from error
+    if not isinstance(weights, dict):
+        raise ValueError(f"it holds a {type(weights).__name__}, not a state dict")
+    return {str(name): value for name, value in weights.items()}
+
+
+def kind_of(data: bytes) -> str:
+    """Names the kind of a file that `torch.save` did not write."""
+    if not data:
+        return "empty"
+    start = data[:256].lstrip(b"\xef\xbb\xbf \t\r\n")
+    known = next((words for mark, words in OTHERS if start.startswith(mark)), None)
+    return known or ("a safetensors file" if data[8:9] == b"{" else "no file of torch.save")

@@ -1,4 +1,4 @@
-"""Parser of `gsx judge`."""
+"""Parsers of `gsx prepare` and `gsx judge`."""
 
 import argparse
 from pathlib import Path
@@ -43,7 +43,9 @@ def parse_methods(arguments: list[str]) -> argparse.Namespace:
     options = parser.parse_intermixed_args(arguments)
     options.line = arguments
     options.methods, options.folders, options.overrides = sorted_words(options.words)
-    refuse_absent(options)
+    for flag in ("order", "depth"):
+        if (path := getattr(options, flag)) is not None and not path.exists():
+            raise InputError(f"gsx judge: --{flag} {path} does not exist: check its name")
     return options
 
 
@@ -68,7 +70,7 @@ def sorted_words(words: list[str]) -> tuple[list[tuple[str, Path]], list[Path], 
         name, equals, value = word.partition("=")
         if not equals:
             folders.append(existing_folder(word))
-        elif is_setting(word):
+        elif is_override(word) and key_of(word) in SETTINGS:
             overrides.append(word)
         else:
             methods.append((name, existing_path(name, value)))
@@ -78,11 +80,6 @@ def sorted_words(words: list[str]) -> tuple[list[tuple[str, Path]], list[Path], 
             f"of settings ({', '.join(SETTINGS[:5])} ...) cannot be names of methods"
         )
     return methods, folders, overrides
-
-
-def is_setting(word: str) -> bool:
-    """Return whether a word sets the scene or how figures are measured."""
-    return is_override(word) and key_of(word) in SETTINGS
 
 
 def existing_folder(word: str) -> Path:
@@ -107,9 +104,50 @@ def existing_path(name: str, word: str) -> Path:
     return path
 
 
-def refuse_absent(options: argparse.Namespace) -> None:
-    """Raise InputError for files of options that do not exist."""
-    for flag in ("order", "depth"):
-        path = getattr(options, flag)
-        if path is not None and not path.exists():
-            raise InputError(f"gsx judge: --{flag} {path} does not exist: check its name")
+KEYS = ("scene", "dataset", "data_root", "protocol", "eval", "metrics", "seed")
+"""Settings that decide photos, cameras and figures."""
+
+
+def parse_prepare(arguments: list[str]) -> argparse.Namespace:
+    """Parse `gsx prepare [FOLDER] --to OUT [KEY=VALUE ...] [--with-test] [--with-truth]`."""
+    description = (
+        "Write a scene for other programs: the training photos as gsx trains on them, a COLMAP model, transforms.json, "
+        "and cameras of the test views at each zoom. For example: gsx prepare FOLDER --to OUT scene.downscale=4 "
+        "'eval.zoom=[1,2,4]', or gsx prepare --to OUT scene=demo."
+    )
+    parser = Parser("prepare", description, "[FOLDER] --to OUT [KEY=VALUE ...] [options]")
+    parser.settings = True
+    words = "folder of a scene, then settings of scene and evaluation, as for training"
+    parser.add_argument("words", nargs="*", default=[], metavar="FOLDER|KEY=VALUE", help=words)
+    parser.add_argument("--to", type=Path, required=True, metavar="OUT", help="folder to write; it must not exist")
+    test = "put test photos into images/ as well, for programs that split by themselves"
+    parser.add_argument("--with-test", action="store_true", help=test)
+    truth = "also write test photos at each zoom to truth/xK/"
+    parser.add_argument("--with-truth", action="store_true", help=truth)
+    options = parser.parse_intermixed_args(arguments)
+    options.folder = folder_among(options.words)
+    options.to = expand_home(options.to)
+    return options
+
+
+def folder_among(words: list[str]) -> Path | None:
+    """Return the folder if it is the first word; raise for words that belong to no scene."""
+    folder = expand_home(words[0]) if words and not is_override(words[0]) else None
+    overrides = words if folder is None else words[1:]
+    if folder is not None and not folder.exists():
+        raise InputError(f"gsx prepare: '{folder}' does not exist: give the folder of a scene, or scene=demo")
+    for word in overrides:
+        refuse_other(word, folder)
+    if folder is None and not any(word.startswith(("scene=", "dataset=")) for word in overrides):
+        raise ConfigError("gsx prepare needs a scene: give FOLDER, or scene=demo, or scene=colmap scene.path=FOLDER")
+    return folder
+
+
+def refuse_other(word: str, folder: Path | None) -> None:
+    """Raise ConfigError for a word that changes nothing in a prepared folder, or names another scene."""
+    if not is_override(word):
+        raise ConfigError(f"gsx prepare: '{word}' is no setting (KEY=VALUE): the folder comes first")
+    if key_of(word) not in KEYS:
+        raise ConfigError(f"gsx prepare does not take '{word}': it writes a scene and trains nothing, leave it out")
+    if folder is not None and word.startswith(("scene=", "scene.path=", "dataset=")):
+        raise ConfigError(f"gsx prepare {folder}: '{word}' does not go with the folder of a scene: leave it out")
