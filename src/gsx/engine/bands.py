@@ -6,6 +6,7 @@ for blending. Sums over bands round differently from sums over the picture.
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -51,7 +52,7 @@ class InBands:
         if few or not learning or screen.weigh or screen.means.device.type != "cpu":
             return self.composite(screen, channels, intersections, grid, settings)
 
-        def blend(rows: range, fields: list[Tensor]) -> Float[Tensor, "C_plus_1 h W"]:
+        def blend(rows: range, fields: list[Any]) -> Float[Tensor, "C_plus_1 h W"]:
             splats = replace(screen, **dict(zip(FIELDS, fields, strict=True)))
             pairs, raster = pairs_of(intersections, rows, grid), band_of(grid, rows)
             return self.composite(splats, splats.channels, pairs, raster, settings)[0]
