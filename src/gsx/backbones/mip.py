@@ -189,9 +189,10 @@ def visible_depths(
     """Returns (depths z, visibility of the points in the raster and its margin) (Mip-Splatting, compute_3D_filter)."""
     local = camera.to_camera(points).to(points)
     depth = local[:, 2].clamp_min(LEAST_DEPTH)
-    column = local[:, 0] / depth * camera.fx + camera.cx
-    row = local[:, 1] / depth * camera.fy + camera.cy
-    if camera.lens is not None:
+    if camera.lens is None:
+        column = local[:, 0] / depth * camera.fx + camera.cx
+        row = local[:, 1] / depth * camera.fy + camera.cy
+    else:
         column, row = camera.project(points)[0].unbind(1)
     across = (column >= -options.margin * camera.width) & (column <= (1 + options.margin) * camera.width)
     down = (row >= -options.margin * camera.height) & (row <= (1 + options.margin) * camera.height)

@@ -27,6 +27,7 @@ from gsx.engine.compiling import (
     with_last,
 )
 from gsx.engine.pixel_windows import behind_splat
+from gsx.lenses.unscented import project_through_lens, select_through_lens
 
 Kernel: TypeAlias = Callable[..., Any]
 
@@ -45,6 +46,8 @@ def compile_sides(
 HOW: dict[Kernel, Callable[..., Kernel]] = {
     select: compile_rows,
     geometry: partial(compile_rows, options=IN_VECTORS),
+    select_through_lens: compile_rows,
+    project_through_lens: partial(compile_rows, options=IN_VECTORS),
     boxes: partial(compile_rows, options=IN_VECTORS),
     spans: partial(compile_sides, (0,), options=OWN_INDICES | ROWS_ALIKE),
     in_order: fused,

@@ -44,7 +44,7 @@ CHECKED = ("TENSOR_MATCH", "DUPLICATE_INPUT", "SHAPE_ENV")
 Other values are part of the lookup, and the code that the function calls is part of the file's name."""
 TRACING: dict[str, Any] = {"automatic_dynamic_shapes": False, "record_runtime_overhead": False}
 """Options of tracing: no guesses from earlier compilations, and no profiler marks around each call."""
-ROOMS = ("core/data", "core/gaussians", "core/quality", "core/rasterizer", "engine")
+ROOMS = ("core/data", "core/gaussians", "core/quality", "core/rasterizer", "engine", "lenses")
 """Packages of gsx whose code its compiled functions call; import contracts keep them from the others."""
 IMPORTED = time.time()
 """Newer files may differ from the code that this process runs."""

@@ -6,17 +6,21 @@ sensor/models.h).
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import chain
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from gsx.core.backend import Backend
+from gsx.core.device import upload
 from gsx.core.errors import InputError
 from gsx.core.shapes import Bool, Float
-from gsx.lenses.unscented import Unscented
+from gsx.lenses.distortion import Coefficients, Form, bent, distorted, in_view, jacobian, radial_factor, turned
+from gsx.lenses.unscented import project_through_lens, select_through_lens
 
 LARGEST_ANGLE = math.radians(89.0)
 """Largest angle of a ray from the axis: splats behind the camera plane are not drawn."""
@@ -24,8 +28,6 @@ ANGLES, AZIMUTHS = 1780, 72
 """Places at which the map is checked for a fold: one each 0.05 degrees, one each 5 degrees."""
 LEAST_AREA = 0.01
 """Least Jacobian determinant of the distortion, by that at the axis: at a fold it is 0."""
-NEAR_AXIS = 1e-6
-"""Square of a slope below which angle / slope is a series."""
 NEWTON_STEPS = 20
 SAME = 1e-9
 """Largest residual of an inverted distortion, relative to the focal length."""
@@ -34,7 +36,7 @@ IDENTITY = (1.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Distortion(Unscented):
+class Distortion:
     """A lens of COLMAP (implements `gsx.core.data.camera.LensModel`)."""
 
     fisheye: bool = False
@@ -53,15 +55,19 @@ class Distortion(Unscented):
 
     def bend(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 2"]:
         """Return distorted slopes of points in camera coordinates; NaN beyond the fold or behind the camera."""
-        plane, valid = self._on_plane(points.double())
-        return torch.where(valid[:, None], self._turned(self._distorted(plane)), torch.nan).to(points)
+        x, y, z = points.double().unbind(1)
+        valid = in_view(self.coefficients, x, y, z)
+        x, y, z = torch.where(valid, x, 0.0), torch.where(valid, y, 0.0), torch.where(valid, z, 1.0)
+        slopes = torch.stack(bent(self.coefficients, self.form, x, y, z), 1)
+        return torch.where(valid[:, None], slopes, torch.nan).to(points)
 
     def straighten(self, slopes: Float[Tensor, "P 2"]) -> Float[Tensor, "P 2"]:
         """Return slopes of rays by their distorted slopes; NaN where there is no ray."""
-        plane = self._undistorted(self._turned(slopes.double(), back=True))
+        back = turned(self.coefficients, self.form, *slopes.double().unbind(1), back=True)
+        plane = self._undistorted(torch.stack(back, 1))
         radius = plane.norm(dim=1, keepdim=True)
         factor = torch.where(radius > 0, radius.tan() / radius, 1.0) if self.fisheye else 1.0
-        return self._turned(plane * factor).to(slopes)
+        return torch.stack(turned(self.coefficients, self.form, *(plane * factor).unbind(1)), 1).to(slopes)
 
     def turned(self, turn: Sequence[float]) -> "Distortion":
         """Return the lens of a camera that is turned about its axis; turn: rows of the 2 x 2 matrix."""
@@ -69,107 +75,80 @@ class Distortion(Unscented):
         a, b, c, d = rows.flatten().tolist()
         return replace(self, turn=(a, b, c, d))
 
-    # -- steps ---------------------------------------------------------------------------------------------------------
+    # -- projection of Gaussians ---------------------------------------------------------------------------------------
 
-    def _turned(self, places: Float[Tensor, "P 2"], back: bool = False) -> Float[Tensor, "P 2"]:
-        if self.turn == IDENTITY:
-            return places
-        rows = places.new_tensor(self.turn).view(2, 2)
-        return places @ (rows if back else rows.T)
+    def selection(self, backend: Backend) -> Callable[..., Bool[Tensor, "N"]]:
+        """Return `select_through_lens` of this lens."""
+        kernel = backend.kernel(select_through_lens, self.form)
+        return lambda points, *others: kernel(points, *others, upload(self.numbers, points.device))
 
-    def _on_plane(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 2"], Bool[Tensor, "P"]]:
-        """Return places of points on the plane, 0 where the lens shows none, and where it shows one."""
-        across, depth = self._turned(points[:, :2], back=True), points[:, 2]
-        squares = across.square().sum(1)
-        steepest = math.tan(self.limit) if self.fisheye else self.limit
-        valid = (depth > 0) & (squares <= (steepest * depth).square())
-        across = torch.where(valid[:, None], across / torch.where(valid, depth, 1.0)[:, None], 0.0)
-        if not self.fisheye:
-            return across, valid
-        squares = across.square().sum(1)
-        near = squares < NEAR_AXIS
-        slopes = torch.where(near, 1.0, squares).sqrt()
-        factor = torch.where(near, 1 - squares / 3 + squares.square() / 5, slopes.atan() / slopes)
-        return across * factor[:, None], valid
+    def projection(self, backend: Backend, variant: tuple[bool, bool]) -> Callable[..., tuple[Tensor | None, ...]]:
+        """Return `project_through_lens` of this lens."""
+        kernel = backend.kernel(project_through_lens, self.form, variant=variant)
+        return lambda points, *others: kernel(points, *others, upload(self.numbers, points.device))
 
-    def _factor(self, squares: Float[Tensor, "P"]) -> Float[Tensor, "P"]:
-        """Return the factor of the radius."""
-        above = polynomial((1.0, *self.radial), squares)
-        return above / polynomial((1.0, *self.divisor), squares) if any(self.divisor) else above
-
-    def _factor_slope(self, squares: Float[Tensor, "P"]) -> Float[Tensor, "P"]:
-        """Return the derivative of the factor by the squared radius."""
-        above, below = (derivative((1.0, *coefficients)) for coefficients in (self.radial, self.divisor))
-        change = polynomial(above, squares) - self._factor(squares) * polynomial(below, squares)
-        return change / polynomial((1.0, *self.divisor), squares)
-
-    def _distorted(self, plane: Float[Tensor, "P 2"]) -> Float[Tensor, "P 2"]:
-        x, y = plane.unbind(1)
-        (p1, p2), (s1, s2), squares = self.tangential, self.prism, x * x + y * y
-        across, down = plane.T * self._factor(squares)
-        if any((p1, p2)):
-            across = across + 2 * p1 * x * y + p2 * (squares + 2 * x * x)
-            down = down + 2 * p2 * x * y + p1 * (squares + 2 * y * y)
-        if any((s1, s2)):
-            across, down = across + s1 * squares, down + s2 * squares
-        return torch.stack([across, down], 1)
-
-    def _jacobian(self, plane: Float[Tensor, "P 2"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the derivatives of `_distorted` by row: (ax, ay, dx, dy)."""
-        x, y = plane.unbind(1)
-        (p1, p2), (s1, s2) = self.tangential, self.prism
-        factor, slope = self._factor(x * x + y * y), self._factor_slope(x * x + y * y)
-        both = 2 * x * y * slope + 2 * (p1 * x + p2 * y)
-        return (
-            factor + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x + 2 * s1 * x,
-            both + 2 * s1 * y,
-            both + 2 * s2 * x,
-            factor + 2 * y * y * slope + 2 * p2 * x + 6 * p1 * y + 2 * s2 * y,
+    @cached_property
+    def form(self) -> Form:
+        """Terms that are not 0."""
+        return Form(
+            fisheye=self.fisheye,
+            radial=max((n for n, k in enumerate(self.radial, 1) if k), default=0),
+            divisor=max((n for n, k in enumerate(self.divisor, 1) if k), default=0),
+            tangential=any(self.tangential),
+            prism=any(self.prism),
+            turned=self.turn != IDENTITY,
         )
 
+    @cached_property
+    def coefficients(self) -> Coefficients:
+        """Coefficients as floats."""
+        steepest = math.tan(self.limit) if self.fisheye else self.limit
+        return self._distortion._replace(steepest=steepest)
+
+    @cached_property
+    def numbers(self) -> Float[Tensor, "16"]:
+        """Coefficients as a tensor, float64."""
+        *parts, steepest = self.coefficients
+        return torch.tensor([*chain(*parts), steepest], dtype=torch.float64)
+
+    # -- inverse -------------------------------------------------------------------------------------------------------
+
+    @property
+    def _distortion(self) -> Coefficients:
+        """Coefficients without the steepest slope, which follows from them."""
+        return Coefficients(self.radial, self.divisor, self.tangential, self.prism, self.turn, math.inf)
+
     def _undistorted(self, places: Float[Tensor, "P 2"]) -> Float[Tensor, "P 2"]:
-        """Invert `_distorted` by Newton's method from the inverse of the radial part; NaN where it has none."""
+        """Invert `distorted` by Newton's method from the inverse of the radial part; NaN where it has none."""
+        lens = self._distortion, self.form
         lengths, last = places.norm(dim=1), min(self.limit, math.tan(LARGEST_ANGLE))
         radii = torch.linspace(0, last, ANGLES, dtype=torch.float64, device=places.device)
-        table = radii * self._factor(radii.square())
+        table = radii * radial_factor(*lens, radii.square())
         nearest = torch.searchsorted(table.cummax(0).values, lengths).clamp(max=ANGLES - 1)
         plane = places * (radii[nearest] / lengths.clamp_min(1e-30))[:, None]
         for _ in range(NEWTON_STEPS):
-            a, b, c, d = self._jacobian(plane)
-            x, y = (self._distorted(plane) - places).unbind(1)
+            a, b, c, d = jacobian(*lens, *plane.unbind(1))
+            x, y = (torch.stack(distorted(*lens, *plane.unbind(1)), 1) - places).unbind(1)
             step = torch.stack([d * x - b * y, a * y - c * x], 1) / (a * d - b * c)[:, None]
             plane = plane - step.nan_to_num()
             plane = plane * (last / plane.norm(dim=1).clamp_min(last))[:, None]
-        same = (self._distorted(plane) - places).norm(dim=1) <= SAME * (1 + lengths)
-        return torch.where(same[:, None], plane, torch.nan)
+        left = torch.stack(distorted(*lens, *plane.unbind(1)), 1) - places
+        return torch.where((left.norm(dim=1) <= SAME * (1 + lengths))[:, None], plane, torch.nan)
 
     # -- folds ---------------------------------------------------------------------------------------------------------
 
     @cached_property
     def limit(self) -> float:
         """Radius on the plane up to which the picture grows in all directions, at most that of `LARGEST_ANGLE`."""
+        lens = self._distortion, self.form
         angles = torch.linspace(0, LARGEST_ANGLE, ANGLES + 1, dtype=torch.float64)
         radii = angles if self.fisheye else angles.tan()
         turns = torch.linspace(0, 2 * math.pi, AZIMUTHS + 1, dtype=torch.float64)[:-1]
-        plane = (radii[:, None, None] * torch.stack([turns.cos(), turns.sin()], 1)).flatten(0, 1)
-        a, b, c, d = self._jacobian(plane)
-        outward = (self._distorted(plane) * plane).sum(1) >= 0
-        grows = ((a * d - b * c > LEAST_AREA) & outward).view(ANGLES + 1, AZIMUTHS).all(1)
+        x, y = (radii[:, None] * side for side in (turns.cos(), turns.sin()))
+        (a, b, c, d), (across, down) = jacobian(*lens, x, y), distorted(*lens, x, y)
+        outward = across * x + down * y >= 0
+        grows = ((a * d - b * c > LEAST_AREA) & outward).all(1)
         return float(radii[int(grows.long().cumprod(0).sum()) - 1])
-
-
-def polynomial(coefficients: Sequence[float], squares: Float[Tensor, "P"]) -> Float[Tensor, "P"]:
-    """Return c0 + c1 s + c2 s^2 + ..., without products of leading zeros."""
-    last = max((n for n, coefficient in enumerate(coefficients) if coefficient), default=0)
-    value = torch.full_like(squares, coefficients[last])
-    for coefficient in reversed(coefficients[:last]):
-        value = value * squares + coefficient
-    return value
-
-
-def derivative(coefficients: Sequence[float]) -> list[float]:
-    """Return the coefficients of a polynomial's derivative."""
-    return [n * coefficient for n, coefficient in enumerate(coefficients)][1:]
 
 
 NATIVE = (

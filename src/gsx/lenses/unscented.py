@@ -5,7 +5,8 @@ screen. In half differences d and half second differences e of each pair, the co
 
     sum (d d^T + e e^T) / c^2 + (beta - alpha^2) m m^T,  m = sum e / c^2,  c^2 = alpha^2 (3 + kappa),
 
-a sum of squares without the transform's large weights of both signs (docs/explanation/numerics.md).
+a sum of squares without the transform's large weights of both signs (docs/explanation/numerics.md). Both kernels take
+the lens as a tensor, so that compiled code serves all lenses of one form.
 """
 
 import math
@@ -13,8 +14,9 @@ import math
 import torch
 from torch import Tensor
 
-from gsx.core.rasterizer.geometry import Columns, rotate_back, shape_of, unit
+from gsx.core.rasterizer.geometry import Columns, plus, rotate_back, scaled, shape_of, unit
 from gsx.core.shapes import Bool, Float
+from gsx.lenses.distortion import Coefficients, Form, bent, in_view
 
 ALPHA, BETA, KAPPA = 0.1, 2.0, 0.0
 """gsplat 1.5 (UnscentedTransformParameters). 3DGUT's alpha is 1, whose points on the axes of large splats pass behind
@@ -25,74 +27,72 @@ OUTSIDE = 2.0
 """Largest distance of a projected mean from the frame's middle, by that of the bounds of its slopes."""
 
 
-class Unscented:
-    """Lens that projects Gaussians by its `bend`."""
+def select_through_lens(
+    points: Float[Tensor, "N 3"],
+    scales: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    rotation: Float[Tensor, "3 3"],
+    low: Float[Tensor, "2"],
+    high: Float[Tensor, "2"],
+    numbers: Float[Tensor, "16"],
+    form: Form,
+) -> Bool[Tensor, "N"]:
+    """Marks Gaussians whose sigma points the lens shows, with a mean within `OUTSIDE` of the frame.
 
-    def bend(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 2"]:
-        """Return distorted slopes of points in camera coordinates; NaN where the lens shows none."""
-        raise NotImplementedError
-
-    @torch.no_grad()
-    def visible(
-        self,
-        points: Float[Tensor, "N 3"],
-        scales: Float[Tensor, "N 3"],
-        quats: Float[Tensor, "N 4"],
-        rotation: Float[Tensor, "3 3"],
-        low: Float[Tensor, "2"],
-        high: Float[Tensor, "2"],
-    ) -> Bool[Tensor, "N"]:
-        """Mark Gaussians whose sigma points the lens shows, with a mean within `OUTSIDE` of the frame."""
-        middle, half = (low + high) / 2, (high - low) / 2
-        near = ((self.bend(points) - middle).abs() <= OUTSIDE * half).all(1)  # false for NaN
-        rows = near.nonzero()[:, 0]
-        images = self.images(points[rows], scales[rows], quats[rows], rotation)
-        return near.index_put((rows,), images.isfinite().all(2).all(0))
-
-    def geometry(
-        self,
-        points: Float[Tensor, "M 3"],
-        scales: Float[Tensor, "M 3"],
-        quats: Float[Tensor, "M 4"],
-        rotation: Float[Tensor, "3 3"],
-        intrinsics: Float[Tensor, "4"],
-        low: Float[Tensor, "2"],
-        high: Float[Tensor, "2"],
-        dilation: Float[Tensor, "1"],
-        compensate: bool,
-        drawn: Float[Tensor, "1"] | None = None,
-    ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M"] | None]:
-        """Project Gaussians (`gsx.core.rasterizer.geometry.geometry`); computed in float64, as positions there."""
-        focal, centre = intrinsics[:2], intrinsics[2:]
-        mean, across, down = moments(self.images(points, scales, quats, rotation))
-        p, q = (tuple((f * part).to(scales) for part in row) for f, row in zip(focal, (across, down), strict=True))
-        return (mean * focal + centre).to(scales), *shape_of(p, q, dilation, compensate, drawn)
-
-    def images(
-        self,
-        points: Float[Tensor, "M 3"],
-        scales: Float[Tensor, "M 3"],
-        quats: Float[Tensor, "M 4"],
-        rotation: Float[Tensor, "3 3"],
-    ) -> Float[Tensor, "7 M 2"]:
-        """Return distorted slopes of the sigma points: the mean, three on one side of it, three on the other."""
-        steps = REACH * axes_of(scales, quats, rotation).double()
-        sigma = torch.cat([points[None], points + steps, points - steps])
-        return self.bend(sigma.flatten(0, 1)).view(7, -1, 2)
+    `low`, `high`: bounds of distorted slopes on the frame.
+    """
+    lens = Coefficients.of(numbers)
+    marked = torch.ones_like(points[:, 0], dtype=torch.bool)
+    for point in sigma_points(points, scales, quats, rotation):
+        marked = marked & in_view(lens, *point)
+    for slope, least, most in zip(bent(lens, form, *points.unbind(1)), low, high, strict=True):
+        marked = marked & ((slope - (least + most) / 2).abs() <= OUTSIDE * (most - least) / 2)
+    return marked
 
 
-def axes_of(
-    scales: Float[Tensor, "M 3"], quats: Float[Tensor, "M 4"], rotation: Float[Tensor, "3 3"]
-) -> Float[Tensor, "3 M 3"]:
-    """Return the three axes of each Gaussian in camera coordinates, one standard deviation long."""
-    rows = [torch.stack(rotate_back(unit(quats), row.unbind())) for row in rotation]
-    return torch.stack(rows, 2) * scales.T[:, :, None]
+def project_through_lens(
+    points: Float[Tensor, "M 3"],
+    scales: Float[Tensor, "M 3"],
+    quats: Float[Tensor, "M 4"],
+    rotation: Float[Tensor, "3 3"],
+    intrinsics: Float[Tensor, "4"],
+    dilation: Float[Tensor, "1"],
+    compensate: bool,
+    drawn: Float[Tensor, "1"] | None,
+    numbers: Float[Tensor, "16"],
+    form: Form,
+) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M"] | None]:
+    """Projects Gaussians (`gsx.core.rasterizer.geometry.geometry`); computed in float64, as positions there."""
+    lens = Coefficients.of(numbers)
+    stacked = (torch.stack(parts) for parts in zip(*sigma_points(points, scales, quats, rotation), strict=True))
+    images = [side.unbind() for side in bent(lens, form, *stacked)]
+    fx, fy, cx, cy = intrinsics
+    means, rows = [], []
+    for focal, centre, slopes in zip((fx, fy), (cx, cy), images, strict=True):
+        mean, row = moments(slopes)
+        means.append(mean * focal + centre)
+        rows.append(tuple((focal * part).to(scales) for part in row))
+    return torch.stack(means, 1).to(scales), *shape_of(rows[0], rows[1], dilation, compensate, drawn)
 
 
-def moments(images: Float[Tensor, "7 M 2"]) -> tuple[Float[Tensor, "M 2"], Columns, Columns]:
-    """Return means, and the rows p, q with the covariance p.p, p.q, q.q, of images of sigma points."""
+def sigma_points(
+    points: Float[Tensor, "M 3"],
+    scales: Float[Tensor, "M 3"],
+    quats: Float[Tensor, "M 4"],
+    rotation: Float[Tensor, "3 3"],
+) -> list[Columns]:
+    """Returns the sigma points of Gaussians: the mean, three on one side of it, three on the other."""
+    turn, sizes = unit(quats), scales.unbind(1)
+    rows = [scaled(rotate_back(turn, row.unbind()), sizes) for row in rotation]
+    axes = [tuple(part.double() for part in axis) for axis in zip(*rows, strict=True)]
+    middle = points.unbind(1)
+    return [middle, *(plus(middle, side * REACH, axis) for side in (1, -1) for axis in axes)]
+
+
+def moments(images: Columns) -> tuple[Float[Tensor, "M"], Columns]:
+    """Returns means along x or y of images of sigma points, and rows whose products are the covariance."""
     middle, before, after = images[0], images[1:4], images[4:]
-    first, second = (before - after) / (2 * REACH), ((before + after) / 2 - middle) / REACH
-    shift = second.sum(0) / REACH
-    columns = torch.cat([first, second, math.sqrt(BETA - ALPHA**2) * shift[None]])
-    return middle + shift, columns[..., 0].unbind(), columns[..., 1].unbind()
+    first = [(a - b) / (2 * REACH) for a, b in zip(before, after, strict=True)]
+    second = [((a + b) / 2 - middle) / REACH for a, b in zip(before, after, strict=True)]
+    shift = (second[0] + second[1] + second[2]) / REACH
+    return middle + shift, (*first, *second, math.sqrt(BETA - ALPHA**2) * shift)

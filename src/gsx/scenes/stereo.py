@@ -170,9 +170,9 @@ def projected_at(
     turn = other.rotation.double() @ camera.rotation.double().T
     move = other.translation.double() - turn @ camera.translation.double()
     x, y, z = ((turn @ rays).float() * depths[:, None, None] + move.float()[:, None]).unbind(1)
-    safe = z.clamp_min(1e-6)
-    right, below = x / safe, y / safe
-    if other.lens is not None:
+    if other.lens is None:
+        right, below = (side / z.clamp_min(1e-6) for side in (x, y))
+    else:
         right, below = other.lens.bend(torch.stack([x, y, z], -1).flatten(0, -2)).T.reshape(2, *x.shape)
     across = 2 * (right * other.fx + other.cx) / other.width - 1
     down = 2 * (below * other.fy + other.cy) / other.height - 1

@@ -6,14 +6,17 @@ from dataclasses import replace
 import pycolmap
 import pytest
 import torch
-from raster_scenes import SMOOTH, any_path, front_camera, random_splats, soft_splats
+from raster_scenes import SMOOTH, any_path, changed, front_camera, random_splats, render_with_gradients, soft_splats
 
 from gsx.core.data.camera import Camera, pinhole
 from gsx.core.gaussians.quaternions import rotation_matrices
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer import RasterSettings, rasterize
 from gsx.core.rasterizer.projection import project
+from gsx.engine.backend import COMPILED
+from gsx.engine.compiling import CompiledOnce, available
 from gsx.lenses import Distortion, lens_of
+from gsx.lenses.unscented import project_through_lens
 
 BARE = RasterSettings(dilation=1e-6, cull="tight", alpha_min=1e-9)
 FISHEYE = Distortion(fisheye=True, radial=(0.02, -0.01, 0.005, -0.001))
@@ -109,7 +112,18 @@ def test_splats_beyond_the_fold_or_behind_are_not_drawn() -> None:
     assert screen.dropped == 0
 
 
-def test_the_compiled_path_draws_the_same() -> None:
-    camera, splats = with_lens(front_camera(), FISHEYE), random_splats()
-    eager, compiled = (rasterize(splats, camera, any_path(path=path)).image for path in ("eager", "compiled"))
-    assert float((eager - compiled).abs().max()) < 1e-5
+@pytest.mark.skipif(not available(), reason="no working compiler")
+def test_one_compiled_code_serves_all_lenses_of_a_form_with_pictures_and_gradients_of_float64() -> None:
+    kernel = COMPILED.kernel(project_through_lens, FISHEYE.form, variant=(False, False))
+    assert isinstance(kernel, CompiledOnce)
+    splats, pictures, codes = random_splats(), [], []
+    for lens in (FISHEYE, replace(FISHEYE, radial=(0.1, 0.05, -0.02, 0.01))):
+        camera = with_lens(front_camera(), lens)
+        exact, truth = render_with_gradients(changed(splats, dtype=torch.float64), camera, any_path(cull="tight"))
+        rendering, found = render_with_gradients(splats, camera, any_path(cull="tight", path="compiled"))
+        assert float((rendering.image - exact.image).detach().abs().max()) < 1e-5
+        assert all(float((found[name] - true).norm()) <= 1e-4 * float(true.norm()) for name, true in truth.items())
+        pictures.append(exact.image.detach())
+        codes.append(sum(map(len, kernel.cached.codes.values())))
+    assert codes[0] == codes[1] > 0
+    assert float((pictures[0] - pictures[1]).abs().max()) > 0.01

@@ -5,13 +5,14 @@ covers [0, width] x [0, height]; the principal point (cx, cy) may lie outside th
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from gsx.core.backend import Backend
 from gsx.core.device import upload
 from gsx.core.errors import InputError
 from gsx.core.shapes import Bool, Float
@@ -53,31 +54,15 @@ class LensModel(Protocol):
     def straighten(self, slopes: Float[Tensor, "P 2"]) -> Float[Tensor, "P 2"]:
         """Returns slopes of rays by their distorted slopes; NaN where there is no ray."""
 
-    def visible(
-        self,
-        points: Float[Tensor, "N 3"],
-        scales: Float[Tensor, "N 3"],
-        quats: Float[Tensor, "N 4"],
-        rotation: Float[Tensor, "3 3"],
-        low: Float[Tensor, "2"],
-        high: Float[Tensor, "2"],
-    ) -> Bool[Tensor, "N"]:
-        """Marks Gaussians that `geometry` projects; distorted slopes of the frame lie between low and high."""
+    def selection(self, backend: Backend) -> Callable[..., Bool[Tensor, "N"]]:
+        """Returns a function that marks Gaussians that `projection` takes.
 
-    def geometry(
-        self,
-        points: Float[Tensor, "M 3"],
-        scales: Float[Tensor, "M 3"],
-        quats: Float[Tensor, "M 4"],
-        rotation: Float[Tensor, "3 3"],
-        intrinsics: Float[Tensor, "4"],
-        low: Float[Tensor, "2"],
-        high: Float[Tensor, "2"],
-        dilation: Float[Tensor, "1"],
-        compensate: bool,
-        drawn: Float[Tensor, "1"] | None = None,
-    ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M"] | None]:
-        """Projects Gaussians, as `gsx.core.rasterizer.geometry.geometry`."""
+        Its arguments: points in camera coordinates, scales, quats, the camera's rotation, and the least and the largest
+        distorted slopes on the frame.
+        """
+
+    def projection(self, backend: Backend, variant: tuple[bool, bool]) -> Callable[..., Any]:
+        """Returns a function that projects Gaussians as `geometry` of the rasterizer does, which has more arguments."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -133,17 +133,17 @@ def geometry(
     quats: Float[Tensor, "M 4"],
     rotation: Float[Tensor, "3 3"],
     intrinsics: Float[Tensor, "4"],
-    low: Float[Tensor, "2"],
-    high: Float[Tensor, "2"],
     dilation: Float[Tensor, "1"],
     compensate: bool,
-    drawn: Float[Tensor, "1"] | None = None,
+    drawn: Float[Tensor, "1"] | None,
+    low: Float[Tensor, "2"],
+    high: Float[Tensor, "2"],
 ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M"] | None]:
     """Returns screen means (px of the frame), dilated covariances, their factors, and ln of the opacity factor or None.
 
-    `points`: means in camera coordinates, float64; `intrinsics`: (fx, fy, cx, cy) on the frame, float64; `low`, `high`:
-    bounds of x/z and y/z in the Jacobian; `dilation`, px^2; the opacity factor compensates all of it (`compensate`), or
-    its difference from `drawn`, the dilation in training.
+    `points`: means in camera coordinates, float64; `intrinsics`: (fx, fy, cx, cy) on the frame, float64; `dilation`,
+    px^2; the opacity factor compensates all of it (`compensate`), or its difference from `drawn`, the dilation in
+    training; `low`, `high`: bounds of x/z and y/z in the Jacobian.
     """
     x, y, z = points.unbind(1)
     fx, fy, cx, cy = intrinsics

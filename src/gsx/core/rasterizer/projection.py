@@ -14,7 +14,7 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.bags import sum_runs
 from gsx.core.rasterizer.geometry import geometry
-from gsx.core.rasterizer.selection import chosen_rows, lens_of, select_splats, slope_bounds
+from gsx.core.rasterizer.selection import chosen_rows, lens_of, select_splats, select_through, slope_bounds
 from gsx.core.rasterizer.settings import RasterSettings
 from gsx.core.shapes import Bool, Float, Int
 
@@ -99,11 +99,12 @@ def project(
     numbers = upload(lens, splats.means.device)
     points = camera.to_camera(splats.means)
     device = splats.means.device.type
-    good, visible = select_splats(splats, points, numbers, settings.backend.on(device) if len(splats) > 1 else EAGER)
-    shape = numbers[:4], numbers[4:6].to(splats.scales), numbers[6:8].to(splats.scales)
+    backend = settings.backend.on(device) if len(splats) > 1 else EAGER
+    good, visible = select_splats(splats, points, numbers, backend)
+    bounds = numbers[4:6].to(splats.scales), numbers[6:8].to(splats.scales)
     rotation = upload(camera.rotation, points.device, splats.scales.dtype)
     if camera.lens is not None:
-        visible &= camera.lens.visible(points, splats.scales, splats.quats, rotation, *shape[1:])
+        visible &= select_through(camera.lens, splats, points, rotation, bounds, backend)
     fields = (points, splats.scales, splats.quats, splats.log_opacities, splats.colours)
     ids, dropped = chosen_rows(good, visible)  # before any division
     points, scales, quats, log_opacities, channels = (take_rows(values, ids) for values in fields)
@@ -111,9 +112,12 @@ def project(
     # tensors of one element: torch would compile again for each number, and for each 0-dimensional float64 tensor
     rules = scales.new_full((1,), dilation), compensate, scales.new_full((1,), drawn) if drawn else None
     backend = settings.backend.on(device, learning=True) if len(ids) > 1 else EAGER
-    compiled = backend.kernel(geometry, variant=(compensate, bool(drawn)))
-    compute = compiled if camera.lens is None else camera.lens.geometry
-    means, covariances, conic_factors, compensation = compute(points, scales, quats, rotation, *shape, *rules)
+    gaussians, variant = (points, scales, quats, rotation, numbers[:4], *rules), (compensate, bool(drawn))
+    if camera.lens is None:
+        screen = backend.kernel(geometry, variant=variant)(*gaussians, *bounds)
+    else:
+        screen = camera.lens.projection(backend, variant)(*gaussians)
+    means, covariances, conic_factors, compensation = screen
     if drawn and compensation is not None:  # opacities stay at most alpha_max
         most = log_opacities.clamp_min(math.log(settings.alpha_max))
         compensation = torch.minimum(compensation, most - log_opacities)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsx.core.backend import Backend
-from gsx.core.data.camera import Camera, Frame
+from gsx.core.data.camera import Camera, Frame, LensModel
 from gsx.core.gaussians.splats import Splats
 from gsx.core.rasterizer.settings import CUTOFF_SLACK, WINDOW_TILE, RasterSettings
 from gsx.core.shapes import Bool, Float, Int
@@ -142,6 +142,20 @@ def select_splats(
     fields = (points, splats.means, splats.scales, splats.quats, splats.log_opacities, colours)
     points, means, scales, quats, log_opacities, colours = (value.detach().contiguous() for value in fields)
     return backend.kernel(select)(points, means, scales, quats, log_opacities, colours, numbers.detach())
+
+
+@torch.no_grad()
+def select_through(
+    lens: LensModel,
+    splats: Splats,
+    points: Float[Tensor, "N 3"],
+    rotation: Float[Tensor, "3 3"],
+    bounds: tuple[Float[Tensor, "2"], Float[Tensor, "2"]],
+    backend: Backend,
+) -> Bool[Tensor, "N"]:
+    """Marks splats that a lens projects; `bounds`: of slopes on the frame."""
+    fields = (points, splats.scales, splats.quats, rotation, *bounds)
+    return lens.selection(backend)(*(value.detach().contiguous() for value in fields))
 
 
 def chosen_rows(good: Bool[Tensor, "N"], visible: Bool[Tensor, "N"]) -> tuple[Int[Tensor, "M"], int]:

@@ -194,8 +194,9 @@ def reaching(gaussians: Gaussians, camera: Camera, sigmas: float) -> Bool[Tensor
     """Return which splats are in front of a camera and at most so many deviations outside its picture."""
     x, y, z = camera.to_camera(gaussians.means).unbind(1)
     radius = sigmas * camera.focal * gaussians.log_scales.double().amax(1).exp() / z.clamp_min(1e-12)
-    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    if camera.lens is not None:
+    if camera.lens is None:
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    else:
         u, v = camera.project(gaussians.means.double())[0].unbind(1)
     across = (u >= -radius) & (u <= camera.width + radius)
     return (z > camera.near) & across & (v >= -radius) & (v <= camera.height + radius)
