@@ -31,9 +31,9 @@ def add_backbones(registry: Registry) -> None:
     """Register free Gaussians and anchors, with and without levels and filters."""
     from gsx.backbones.anchor_options import NeuralOptions
     from gsx.backbones.anchors import neural_anchors
+    from gsx.backbones.clone_split import OctreeGS3DOptions, octree_gs3d
     from gsx.backbones.gs3d import gs3d
     from gsx.backbones.gs3d_options import GS3DOptions
-    from gsx.backbones.octree_gs3d import OctreeGS3DOptions, octree_gs3d
 
     for name in ("gs3d", "mip_splatting", "gs3d_zoom"):
         registry.add("backbone", name, gs3d, GS3DOptions)
@@ -61,9 +61,8 @@ def add_augmenters(registry: Registry) -> None:
 
 def add_regenerators(registry: Registry) -> None:
     """Register filters, networks that learn from the scene itself, functions, and pretrained networks."""
-    from gsx.regenerators.called import Called, CalledOptions
-    from gsx.regenerators.classical import Oracle, PlainOptions, Resampled, Unchanged
-    from gsx.regenerators.pretrained.options import PretrainedOptions
+    from gsx.regenerators.classical import Called, CalledOptions, Oracle, PlainOptions, Resampled, Unchanged
+    from gsx.regenerators.pretrained.model_files import PretrainedOptions
     from gsx.regenerators.pretrained.upscaler import Pretrained
     from gsx.regenerators.scene_restorer import RestorerOptions, SceneRestorer
     from gsx.regenerators.scene_sr import SceneSR, SceneSROptions
@@ -80,10 +79,9 @@ def add_regenerators(registry: Registry) -> None:
 
 def add_diffusion(registry: Registry) -> None:
     """Register diffusion models; their packages are imported at first use."""
-    from gsx.regenerators.diffusion.cascade import Cascade, CascadeOptions
     from gsx.regenerators.diffusion.model_specs import SD_X2_LATENT, SD_X4, SDXL_TURBO
     from gsx.regenerators.diffusion.options import PipelineOptions, RestorerOptions, UpscalerOptions
-    from gsx.regenerators.diffusion.redraw import Diffusion, any_pipeline
+    from gsx.regenerators.diffusion.redraw import Cascade, CascadeOptions, Diffusion, any_pipeline
 
     registry.add("regenerator", "diffusers_pipeline", any_pipeline, PipelineOptions)
     registry.add("regenerator", "sd_by_scale", Cascade, CascadeOptions)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsx.augmenters.consistency import BOX, blocks, consistent_pixels, exactly_consistent, repaired, unblocked
+from gsx.augmenters.redraw import BOX, blocks, consistent_pixels, exactly_consistent, repaired, unblocked
 from gsx.core.data.reduction import box_average, projected
 
 

@@ -9,8 +9,8 @@ import torch
 from test_pseudo_details import augmenter_of, copied_gradients, run_at
 from torch import Tensor
 
+from gsx.augmenters.checked_regenerator import MOST_GAIN, gain, gain_over_filter, request_of
 from gsx.augmenters.redraw import batches
-from gsx.augmenters.trust import MOST_GAIN, gain, gain_over_filter, request_of
 from gsx.core.data.camera import look_at
 from gsx.core.errors import TrainingError
 from gsx.core.quality.losses import photometric, ssim_map

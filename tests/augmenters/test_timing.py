@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from gsx.augmenters.timing import Timing, event_at, events_of, progress, ramp, span_of, stepped
+from gsx.augmenters.pseudo_options import Timing, event_at, events_of, progress, ramp, span_of, stepped
 from gsx.builtin import plugins
 from gsx.core.training.schedule import Schedule
 from gsx.experiments.runs.compose import compose

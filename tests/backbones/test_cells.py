@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsx.backbones import cells as module
-from gsx.backbones.cells import cell_keys, new_cells, pooled_max, ranked_keys
+from gsx.backbones.cells import cell_keys, new_cells, pooled_max
 
 FAR = 2**40
 """Cells so far apart that the product of ranges fits no integer of 64 bits."""
@@ -52,22 +51,17 @@ def test_order_of_rows_does_not_change_the_cells():
 
 @pytest.mark.parametrize("ranges", [(18, 18, 18), (2, 3, 90), (90, 2, 3), (3, 90, 2)])
 @pytest.mark.parametrize("start", [0, -9, 2**61])
-def test_keys_of_both_kinds_order_cells_alike(ranges, start):
+def test_keys_order_cells_by_rows(ranges, start):
     generator = torch.Generator().manual_seed(1)
     cells = torch.stack([torch.randint(length, (300,), generator=generator) for length in ranges], dim=1) + start
     by_rows = sorted(range(300), key=lambda i: cells[i].tolist())
     assert cell_keys(cells).argsort(stable=True).tolist() == by_rows
     assert len(cell_keys(cells).unique()) == len(cells.unique(dim=0))
-    assert ranked_keys(cells).argsort(stable=True).tolist() == by_rows
 
 
-def test_ranks_are_used_only_when_ranges_do_not_fit(monkeypatch):
-    used = []
-    monkeypatch.setattr(module, "ranked_keys", lambda cells: used.append(len(cells)) or ranked_keys(cells))
-    cell_keys(torch.tensor([[0, 0, 0], [2**21 - 1, 2**21 - 1, 2**21 - 2]]))
-    assert used == []
-    cell_keys(torch.tensor([[0, 0, 0], [2**21, 2**21, 2**21]]))
-    assert used == [2]
+def test_keys_of_cells_too_far_apart_for_a_product_are_ranks():
+    far = 2**21
+    assert cell_keys(torch.tensor([[far, far, far], [0, 0, 0], [0, 0, 0], [0, 2 * far, 1]])).tolist() == [2, 0, 0, 1]
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (2, 3)])

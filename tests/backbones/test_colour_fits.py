@@ -9,7 +9,8 @@ import torch
 from small_scene import Grey, published_options, small_gs3d, small_scene, spread
 from torch import Tensor
 
-from gsx.backbones.colour_fits import (
+from gsx.backbones.gs3d import GS3D
+from gsx.backbones.sh_degrees import (
     ColourFits,
     coefficients_of,
     colour_fits,
@@ -17,7 +18,6 @@ from gsx.backbones.colour_fits import (
     squared_change,
     take_coefficients,
 )
-from gsx.backbones.gs3d import GS3D
 from gsx.core.data.camera import look_at
 from gsx.core.data.scene import View
 from gsx.core.rasterizer import rasterize

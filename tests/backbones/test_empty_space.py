@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsx.backbones.empty_space import in_empty_space
+from gsx.backbones.adaptive import in_empty_space
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.images import ImageCache, write_image
 from gsx.core.data.masks import Mask

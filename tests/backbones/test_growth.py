@@ -13,6 +13,7 @@ from test_heads import SMALL, heads_of
 from torch.nn import Parameter
 
 from gsx.backbones import growth
+from gsx.backbones.anchor_options import CHOICES, GrowthOptions, Quirks, resolved
 from gsx.backbones.decoding import Explicit, Neural
 from gsx.backbones.density import room_under
 from gsx.backbones.growth import (
@@ -26,7 +27,6 @@ from gsx.backbones.growth import (
     prune,
     reset_offsets,
 )
-from gsx.backbones.growth_options import CHOICES, GrowthOptions, Quirks, resolved
 from gsx.backbones.levels import Levels, Viewpoints, thresholds
 from gsx.core.training.parameter_table import ParameterTable
 

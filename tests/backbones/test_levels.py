@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from gsx.backbones.anchor_options import MODES, LevelOptions, checked_end
 from gsx.backbones.cells import pooled_max
-from gsx.backbones.level_options import MODES, LevelOptions, checked_end
 from gsx.backbones.levels import (
     Levels,
     all_levels_from,

@@ -19,11 +19,18 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.splats import Gaussians, splats_of
 from gsx.core.rasterizer import RasterSettings, rasterize_tiled
 from gsx.formats.arrays import arrays_of
-from gsx.formats.clusters import nearest_number, number_book, vector_book
 from gsx.formats.compressed_ply import encode_compressed_ply, packed_11_10_11
 from gsx.formats.glb import encode_glb
 from gsx.formats.ply import elements_of
-from gsx.formats.sog import encode_sog, mean_words, quaternion_bytes, signed_log
+from gsx.formats.sog import (
+    encode_sog,
+    mean_words,
+    nearest_number,
+    number_book,
+    quaternion_bytes,
+    signed_log,
+    vector_book,
+)
 from gsx.formats.splat_files import SpzForm, compensated, read_gaussians, write_gaussians
 from gsx.formats.spz import encode_spz
 from gsx.formats.turned import to_training_axes

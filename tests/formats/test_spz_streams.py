@@ -16,7 +16,7 @@ from test_compact_files import many, the_splat
 from gsx.backbones.long_axis import covariances
 from gsx.core.errors import InputError
 from gsx.core.gaussians.sh import harmonics
-from gsx.formats import zstd
+from gsx.formats import spz
 from gsx.formats.splat_files import SpzForm, compensated, read_gaussians, read_splats, write_gaussians
 from gsx.formats.turned import spread_directions
 
@@ -266,7 +266,7 @@ def test_without_zstandard_the_remedy_is_named(a_file: Path, monkeypatch: pytest
     def missing(name: str) -> None:
         raise ImportError(name)
 
-    monkeypatch.setattr(zstd, "import_module", missing)
+    monkeypatch.setattr(spz, "import_module", missing)
     with pytest.raises(InputError, match=r"pip install 'gsx\[spz\]'"):
         read_gaussians(written(a_file, streamed()))
     with pytest.raises(InputError, match=r"pip install 'gsx\[spz\]'"):
@@ -283,6 +283,6 @@ def test_python_s_own_module_is_used_where_there_is_one(a_file: Path, monkeypatc
         return zstandard.ZstdCompressor(level=level).compress(data)
 
     module = SimpleNamespace(ZstdFile=opened, compress=compress, ZstdError=zstandard.ZstdError)
-    monkeypatch.setattr(zstd, "import_module", {"compression.zstd": module}.__getitem__)
+    monkeypatch.setattr(spz, "import_module", {"compression.zstd": module}.__getitem__)
     write_gaussians(a_file, replace(the_splat(), means=torch.tensor([[1.0, -2.0, 3.0]])), spz=SpzForm(version=4))
     assert read_gaussians(a_file).means.tolist() == [[1.0, -2.0, 3.0]]

@@ -11,16 +11,18 @@ from tiny import final_tensors, stopped_at, tiny_run
 from torch import Tensor
 
 from gsx.core.files import read_json
-from gsx.modules.appearance import Appearance, AppearanceOptions, response_of
-from gsx.modules.bilateral_grid import WHOLE
-from gsx.modules.colour_response import (
+from gsx.modules.appearance import (
     NUMBERS,
+    Appearance,
+    AppearanceOptions,
     fit_code,
     light_fields,
     principal_codes,
     respond,
+    response_of,
     response_slopes,
 )
+from gsx.modules.bilateral_grid import WHOLE
 from gsx.modules.photo_pairs import Pair
 
 EVERYWHERE = torch.ones(24, 32, dtype=torch.bool)

@@ -19,8 +19,17 @@ from gsx.experiments.runs.build import build
 from gsx.experiments.runs.load_scene import load_scene
 from gsx.modules.exposure import Exposure, ExposureOptions
 from gsx.modules.poses import PoseOptions, Poses
-from gsx.modules.run_state import RunState, return_to, state_of
-from gsx.modules.trial import Stretch, Trial, TrialOptions, WindowPair, error_at_best_gains, gain_of
+from gsx.modules.trial import (
+    RunState,
+    Stretch,
+    Trial,
+    TrialOptions,
+    WindowPair,
+    error_at_best_gains,
+    gain_of,
+    return_to,
+    state_of,
+)
 
 WORDS = (
     "iterations=60",

@@ -19,7 +19,7 @@ from gsx.core.data.reduction import as_blocks
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, TrainingError
 from gsx.experiments.runs.job import train
-from gsx.regenerators.called import Called, CalledOptions
+from gsx.regenerators.classical import Called, CalledOptions
 
 PROMPTS: list[str] = []
 SMALL = ["iterations=12", "scene.points=100", "eval.zoom=[1]"]

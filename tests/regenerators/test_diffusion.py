@@ -29,11 +29,17 @@ from gsx.core.training.parameter_table import table_tensors
 from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.experiments.runs.compose import compose
 from gsx.experiments.runs.open import open_run
-from gsx.regenerators.diffusion.cascade import Cascade
-from gsx.regenerators.diffusion.model_specs import SD_X2_LATENT, SD_X4, SDXL_TURBO, Batch, ModelSpec, steps_for
+from gsx.regenerators.diffusion.model_specs import (
+    SD_X2_LATENT,
+    SD_X4,
+    SDXL_TURBO,
+    Batch,
+    ModelSpec,
+    padded_to,
+    steps_for,
+)
 from gsx.regenerators.diffusion.options import DiffusionOptions
-from gsx.regenerators.diffusion.redraw import Diffusion, any_pipeline
-from gsx.regenerators.diffusion.sizes import padded_to
+from gsx.regenerators.diffusion.redraw import Cascade, Diffusion, any_pipeline
 from gsx.regenerators.diffusion.tuning import closest
 
 pytestmark = [

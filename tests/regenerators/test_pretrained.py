@@ -21,12 +21,10 @@ from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError, InputError, Stopped
 from gsx.experiments.runs.compose import compose
 from gsx.regenerators.pretrained import process
-from gsx.regenerators.pretrained.model_files import Model
-from gsx.regenerators.pretrained.options import ModelOptions, PretrainedOptions
-from gsx.regenerators.pretrained.photo_store import PhotoStore
+from gsx.regenerators.pretrained.model_files import Model, ModelOptions, PretrainedOptions
 from gsx.regenerators.pretrained.process import NetworkProcess
 from gsx.regenerators.pretrained.tiles import run_in_tiles
-from gsx.regenerators.pretrained.upscaler import Pretrained, factors_of
+from gsx.regenerators.pretrained.upscaler import PhotoStore, Pretrained, factors_of
 
 needs_ncnn = pytest.mark.skipif(find_spec("ncnn") is None, reason="needs ncnn: pip install 'gsx[upscalers]'")
 NEAREST = """7767517

@@ -12,7 +12,7 @@ from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.training.regenerator import Regenerator, RegeneratorContext
-from gsx.regenerators.pairs import held_out_pairs, with_own
+from gsx.regenerators.networks import held_out_pairs, with_own
 from gsx.regenerators.scene_restorer import LARGEST_CHANGE, Residual, RestorerOptions, SceneRestorer
 
 

@@ -9,8 +9,8 @@ from torch import Tensor
 from gsx.core.data.camera import Camera, look_at
 from gsx.core.data.scene import View
 from gsx.core.errors import InputError
-from gsx.scenes import duplicates
-from gsx.scenes.duplicates import BLOCK, alike, digest, digest_of_parts, refuse_shared, size
+from gsx.scenes import splits
+from gsx.scenes.splits import BLOCK, alike, digest, digest_of_parts, refuse_shared, size
 
 
 class Source:
@@ -56,15 +56,15 @@ def test_only_files_of_equal_size_on_both_sides_are_opened(tmp_path: Path, monke
         opened.append(path.name)
         return digest(path)
 
-    monkeypatch.setattr(duplicates, "digest_of_parts", noted)
-    monkeypatch.setattr(duplicates, "digest", noted)
+    monkeypatch.setattr(splits, "digest_of_parts", noted)
+    monkeypatch.setattr(splits, "digest", noted)
     refuse_shared(views(*train), views(*test), tmp_path)
     assert sorted(opened) == ["c", "e"]
 
 
 def test_only_what_is_alike_at_three_places_is_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one, other = written(tmp_path, one=b"1", other=b"2")
-    monkeypatch.setattr(duplicates, "digest", None)
+    monkeypatch.setattr(splits, "digest", None)
     refuse_shared(views(one), views(other), tmp_path)
 
 

@@ -22,7 +22,7 @@ from gsx.formats.ply import write_ply
 from gsx.scenes.blender import BlenderOptions
 from gsx.scenes.blender import load as load_blender
 from gsx.scenes.orientation import oriented, oriented_camera
-from gsx.scenes.photo_names import plain_name
+from gsx.scenes.pose_files import plain_name
 from gsx.scenes.transforms import TransformsOptions, load
 
 WIDTH, HEIGHT = 120, 90

@@ -11,13 +11,11 @@ from collections.abc import Set
 from dataclasses import replace
 from typing import Any
 
-from gsx.augmenters.checked_regenerator import CheckedRegenerator, Redrawing
+from gsx.augmenters.checked_regenerator import CheckedRegenerator, Redrawing, gain_over_filter
 from gsx.augmenters.planner import Planner
-from gsx.augmenters.pseudo_options import WEIGHT_MAPS, PseudoOptions
+from gsx.augmenters.pseudo_options import WEIGHT_MAPS, PseudoOptions, event_at, events_of, progress, span_of, stepped
 from gsx.augmenters.redraw import Redrawer
 from gsx.augmenters.store import Store
-from gsx.augmenters.timing import event_at, events_of, progress, span_of, stepped
-from gsx.augmenters.trust import gain_over_filter
 from gsx.core.errors import ConfigError
 from gsx.core.training.augmenter import AugmenterContext
 from gsx.core.training.parameter_table import shared_colour

@@ -1,4 +1,8 @@
-"""Pictures of pseudo views: requests, redrawing and pixel weights (the paper, Practical Implementation)."""
+"""Pictures of pseudo views: requests, redrawing and pixel weights (the paper, Practical Implementation).
+
+`exactly_consistent` makes 8-bit pictures that reduce exactly to their input: the paper's interpolation flexibility,
+guaranteed for box averages.
+"""
 
 import hashlib
 import logging
@@ -13,20 +17,18 @@ import torch
 from torch import Tensor
 
 from gsx.augmenters.checked_regenerator import CheckedRegenerator
-from gsx.augmenters.consistency import consistent_pixels, exactly_consistent
 from gsx.augmenters.pixel_weights import WeightMap, agreeing, in_bytes
 from gsx.augmenters.planner import PseudoViewSpec, reduced
-from gsx.augmenters.pseudo_options import PseudoOptions
+from gsx.augmenters.pseudo_options import PseudoOptions, ramp
 from gsx.augmenters.store import picture_name
-from gsx.augmenters.timing import ramp
 from gsx.core.data.camera import Camera
 from gsx.core.data.images import write_image
 from gsx.core.data.masks import where_counted
-from gsx.core.data.reduction import Reduction, as_blocks
+from gsx.core.data.reduction import Reduction, as_blocks, projected
 from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window
-from gsx.core.shapes import Float, UInt8
+from gsx.core.shapes import Bool, Float, Int, UInt8
 from gsx.core.training.pseudo_views import PseudoView
 from gsx.core.training.regenerator import Request
 from gsx.core.training.render import render
@@ -39,6 +41,9 @@ BATCH, BATCH_PIXELS = 64, 16_000_000
 """Most pictures redrawn per line of progress, and pixels of their results, if they are several: for memory."""
 PICTURED = 3
 """Training views of an event with comparison pictures."""
+BOX = Reduction()
+REPAIRS = 50
+"""Most rounds that spread rounding errors back, for overlapping blocks."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -213,3 +218,77 @@ def photo_window(run: Run, view: View, window: Window, camera: Camera) -> Float[
     """Cuts a window out of a photo; a render by the window's camera replaces masked pixels."""
     photo, counted = window.cut(view.image()), view.counted()
     return photo if counted is None else where_counted(photo, render(run, camera).image.cpu(), counted[window.pixels])
+
+
+def exactly_consistent(
+    image: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int, reduction: Reduction
+) -> UInt8[Tensor, "3 H W"]:
+    """Returns the 8-bit picture near `image` that reduces to `low`: exactly for box averages, else in nearly all
+    pixels."""
+    near = projected(image.float(), low.float() / 255, factor, reduction)
+    return repaired(near, low, factor) if reduction == BOX else settled(near, low, factor, reduction)
+
+
+def settled(
+    near: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int, reduction: Reduction
+) -> UInt8[Tensor, "3 H W"]:
+    """Rounds a picture, and spreads remaining differences from `low` over its pixels."""
+    known = low.float() / 255
+    for _ in range(REPAIRS):
+        off = known - reduction.reduce(to_uint8(near).float() / 255, factor)
+        wrong = torch.where(off.abs() * 255 > 0.5, off, 0)
+        if not bool(wrong.any()):
+            break
+        near = near + factor**2 * reduction.adjoint(wrong, factor)
+    return to_uint8(near)
+
+
+def repaired(near: Float[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int) -> UInt8[Tensor, "3 H W"]:
+    """Rounds such that a^2 (low - 1/2) <= sum of each block < a^2 (low + 1/2), at the least cost.
+
+    Moves values by one level at a time, first those that rounding moved most the other way.
+    """
+    values = blocks(to_uint8(near).long(), factor)
+    exact = blocks(near * 255, factor)
+    area = factor * factor
+    lowest = -(-(2 * low.long() - 1) * area // 2).flatten()
+    highest = ((2 * low.long() + 1) * area - 1).div(2, rounding_mode="floor").flatten()
+    while True:
+        sums = values.sum(1)
+        step = (sums < lowest).long() - (sums > highest).long()
+        if not bool(step.any()):
+            return unblocked(values, low.shape, factor).to(torch.uint8)
+        values = values + moves(values, exact, step)
+
+
+def moves(values: Int[Tensor, "B a"], exact: Float[Tensor, "B a"], step: Int[Tensor, "B"]) -> Int[Tensor, "B a"]:
+    """Returns one level more or less for the value of least cost in each block, within 0..255."""
+    gain = (exact - values) * step[:, None]
+    allowed = ((values + step[:, None]) >= 0) & ((values + step[:, None]) <= 255)
+    chosen = torch.where(allowed, gain, -torch.inf).argmax(1)
+    return torch.zeros_like(values).scatter_(1, chosen[:, None], step[:, None])
+
+
+def blocks(image: Tensor, factor: int) -> Tensor:
+    """Returns the pixels of each block, [3 h w, a^2]."""
+    parts = image.unfold(1, factor, factor).unfold(2, factor, factor)
+    return parts.reshape(-1, factor * factor)
+
+
+def unblocked(values: Int[Tensor, "B a"], shape: torch.Size, factor: int) -> Int[Tensor, "3 H W"]:
+    """Returns the image of `blocks`; `shape`: of the box average."""
+    channels, height, width = shape
+    parts = values.view(channels, height, width, factor, factor).permute(0, 1, 3, 2, 4)
+    return parts.reshape(channels, height * factor, width * factor)
+
+
+def consistent_pixels(
+    image: UInt8[Tensor, "3 H W"], low: UInt8[Tensor, "3 h w"], factor: int, reduction: Reduction
+) -> Bool[Tensor, "h w"]:
+    """Marks pixels of `low` that the image reduces to in 8 bits, in all channels."""
+    if reduction == BOX:
+        sums = blocks(image.long(), factor).sum(1).view(low.shape)
+        back = ((2 * sums + factor * factor) // (2 * factor * factor)).to(torch.uint8)
+    else:
+        back = to_uint8(reduction.reduce(image.float() / 255, factor))
+    return (back == low).all(0)

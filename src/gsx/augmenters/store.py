@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.augmenters.timing import event_at
+from gsx.augmenters.pseudo_options import event_at
 from gsx.core.data.camera import Camera, Frame
 from gsx.core.data.reduction import Reduction
 from gsx.core.errors import InputError

@@ -7,10 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsx.backbones.anchor_options import AnchorOptions
+from gsx.backbones.anchor_options import AnchorOptions, faithful
 from gsx.backbones.decoding import Representation
 from gsx.backbones.growth import DepthGrowth, LevelGrowth, nodes_of
-from gsx.backbones.level_options import faithful
 from gsx.backbones.levels import Levels, all_levels_from, derive, drawn, facts_of, initial_nodes, note_of, warnings_of
 from gsx.backbones.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.core.data.camera import Camera

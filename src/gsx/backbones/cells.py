@@ -37,15 +37,6 @@ def cell_keys(cells: Int[Tensor, "M 3"]) -> Int[Tensor, "M"]:
     low, high = cells.amin(0).tolist(), cells.amax(0).tolist()
     _, height, depth = lengths = [last - first + 1 for first, last in zip(low, high, strict=True)]
     if math.prod(lengths) > LARGEST_KEY:
-        return ranked_keys(cells)
+        return cells.unique(dim=0, return_inverse=True)[1]  # slower, for cells far apart
     x, y, z = (cells - cells.amin(0)).unbind(1)
     return (x * height + y) * depth + z
-
-
-def ranked_keys(cells: Int[Tensor, "M 3"]) -> Int[Tensor, "M"]:
-    """Returns `cell_keys` from ranks of coordinates, at most M^2: for cells too far apart for one product."""
-    keys = torch.zeros_like(cells[:, 0])
-    for coordinate in cells.unbind(1):
-        found, rank = coordinate.unique(return_inverse=True)
-        keys = (keys * len(found) + rank).unique(return_inverse=True)[1]
-    return keys

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gsx.backbones.anchor_options import GrowthOptions, Quirks
 from gsx.backbones.cells import new_cells, pooled_max
 from gsx.backbones.decoding import Representation, lengths
 from gsx.backbones.density import mean_of, within_room
-from gsx.backbones.growth_options import GrowthOptions, Quirks
 from gsx.backbones.levels import Levels, kept, thresholds
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.parameter_table import ParameterTable, append_rows, keep_rows

@@ -10,7 +10,6 @@ from torch.nn import Parameter
 from torch.nn.functional import normalize
 
 from gsx.backbones.capacity import MOST_VIEWS
-from gsx.backbones.colour_fits import colour_fits
 from gsx.backbones.density import add_statistics, densification_statistics, gradient_statistics
 from gsx.backbones.density_control import CloneSplit, DensityControl
 from gsx.backbones.gs3d_options import GS3DOptions
@@ -19,7 +18,7 @@ from gsx.backbones.mcmc import MCMC
 from gsx.backbones.mip import absorb, filter_named
 from gsx.backbones.neighbours import LEAST_SQUARE_DISTANCE, mean_square_distance
 from gsx.backbones.scene_model import SceneModel
-from gsx.backbones.sh_degrees import ChosenDegrees, choose_degrees, hold_bands, lower_degrees, numbers_of
+from gsx.backbones.sh_degrees import ChosenDegrees, choose_degrees, colour_fits, hold_bands, lower_degrees, numbers_of
 from gsx.backbones.sky import NOTHING, SKY_OPACITY, WIDEST, far_away, sky_behind
 from gsx.backbones.visibility import Visibility, VisibleGaussians, everything, extents
 from gsx.core.data.camera import Camera, offsets_from

@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsx.backbones.anchor_options import LevelOptions
 from gsx.backbones.cells import new_cells
 from gsx.backbones.density import quantile
-from gsx.backbones.level_options import LevelOptions
 from gsx.core.data.camera import Camera, centres_of, offsets_from
 from gsx.core.shapes import Bool, Float, Int
 from gsx.core.training.schedule import Schedule
@@ -157,7 +157,11 @@ def derive(points: Float[Tensor, "P 3"], cameras: Sequence[Camera], options: Lev
         zoom=options.zoom,
         views=views,
     )
-    return levels if options.visible_threshold >= 0 else replace(levels, threshold=mean_drawn_fraction(points, levels))
+    if options.visible_threshold >= 0:
+        return levels
+    positions, of, _ = all_nodes(points, levels)
+    threshold = float(drawn_fraction(levels, positions, of).double().mean())
+    return replace(levels, threshold=min(threshold, BELOW_ONE))
 
 
 def distance_range(points: Float[Tensor, "P 3"], views: Viewpoints, fraction: float) -> tuple[float, float]:
@@ -202,12 +206,6 @@ def base_layer(box: float, count: int, options: LevelOptions, pixels: float) -> 
     if not options.cell_pixels:
         return chosen
     return min(chosen, max(0, math.floor(math.log(box * pixels / options.cell_pixels, options.fork) + 1e-9)))
-
-
-def mean_drawn_fraction(points: Float[Tensor, "P 3"], levels: Levels) -> float:
-    """Returns the adaptive threshold: the mean fraction of cameras that draw a node, below 1 (Octree-GS)."""
-    positions, of, _ = all_nodes(points, levels)
-    return min(float(drawn_fraction(levels, positions, of).double().mean()), BELOW_ONE)
 
 
 def all_nodes(

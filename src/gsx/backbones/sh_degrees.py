@@ -1,22 +1,131 @@
 """An SH degree for each Gaussian.
 
 A Gaussian of degree 3 has 59 numbers, 45 of them in three bands that a matt surface does not need. Once, late in the
-run, colours of every lower degree are fitted in training views (`backbones.colour_fits`). Each Gaussian keeps the
-degree with the least squared change of the pictures plus the price of its numbers.
+run, colours of every lower degree are fitted in training views by least squares. Each Gaussian keeps the degree with
+the least squared change of the pictures plus the price of its numbers.
+
+Another colour c' of row k changes a picture by w (c' - c), w its blending weights; squared and summed over pixels, by
+W |c' - c|^2, W the sum of w^2. The sum over views is least if the coefficients x of c' solve
+(sum W Y Y^T) x = sum W Y c, Y the harmonics towards each view. Dropping bands instead loses their mean over the views.
+Reduced-3DGS (Papantonakis et al. 2024) uses means for degree 0, and drops bands for the others.
 """
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from gsx.backbones.capacity import error_exponent
-from gsx.backbones.colour_fits import ColourFits, fitted, squared_change, take_coefficients
+from gsx.core.data.camera import offsets_from
+from gsx.core.data.scene import View
+from gsx.core.gaussians.bands import BAND_0, harmonics_along
+from gsx.core.gaussians.sh import colour_of_constant
 from gsx.core.shapes import Bool, Float, Int
+from gsx.core.training.importance import Probe, ProbeRender, draws_per_view, random_signs, rounding_of
 from gsx.core.training.parameter_table import ParameterTable, edit
 
+RIDGE = 1e-3
+"""Weight of the current coefficients, over the mean diagonal of a system: for directions that no view sees."""
+CHUNK = 1 << 17
+"""Rows whose systems are solved at a time."""
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ColourFits:
+    """Sums over views for the colours of N rows minus their constant ones; n coefficients, the constant one first."""
+
+    grams: Float[Tensor, "n n N"]
+    """W Y Y^T."""
+    products: Float[Tensor, "n 3 N"]
+    """W Y c."""
+    norms: Float[Tensor, "N"]
+    """W |c|^2."""
+    current: Float[Tensor, "n 3 N"]
+    """Current coefficients."""
+    views: Float[Tensor, "N"]
+    """Number of views that show the row."""
+    error: float
+    """Squared error of the views plus that of rounding their photos."""
+
+
+def colour_fits(probe: Probe, views: Sequence[View], generator: torch.Generator, degree: int) -> ColourFits:
+    """Sums the systems of all rows over some views, for fits up to a degree."""
+    table = probe.model.table
+    current = coefficients_of(table, degree)
+    count, n = len(table), len(current)
+    grams, products = current.new_zeros(n, n, count), current.new_zeros(n, 3, count)
+    norms, shows, error = current.new_zeros(count), current.new_zeros(count), 0.0
+    for view in views:
+        render = probe.render(view.camera)
+        weights = weights_of(render, view, draws_per_view(views), generator)
+        basis, constant = basis_of(render, degree), table["sh_dc"].detach()[:, 0]
+        constant = constant if render.rows is None else constant[render.rows]
+        colours = (render.colours.detach() - colour_of_constant(constant)).T
+        weighted = weights * basis
+        grams += render.by_row(weighted[:, None] * basis)
+        products += render.by_row(weighted[:, None] * colours)
+        norms += render.by_row(weights * colours.square().sum(0))
+        shows += render.visible_rows()
+        error += float(probe.squared_error(render.image, view)) + rounding_of(view)
+    return ColourFits(grams=grams, products=products, norms=norms, current=current, views=shows, error=error)
+
+
+def coefficients_of(table: ParameterTable, degree: int) -> Float[Tensor, "n 3 N"]:
+    """Returns coefficients up to a degree, with 0 for the constant one."""
+    rest = table["sh_rest"].detach()[:, : (degree + 1) ** 2 - 1]
+    return torch.cat([torch.zeros_like(table["sh_dc"].detach()), rest], 1).permute(1, 2, 0)
+
+
+def weights_of(render: ProbeRender, view: View, draws: int, generator: torch.Generator) -> Float[Tensor, "M"]:
+    """Estimates each splat's squared blending weights, summed over pixels that count."""
+    signs = (random_signs(render.image.detach(), generator, view.counted()) for _ in range(draws))
+    return torch.stack([render.blending_squares(one) for one in signs]).mean(0)
+
+
+def basis_of(render: ProbeRender, degree: int) -> Float[Tensor, "n M"]:
+    """Evaluates each splat's harmonics towards the camera."""
+    offsets = offsets_from(render.splats.means.detach(), render.camera.centre)
+    constant = torch.full_like(offsets[:, 0], BAND_0)[None]
+    return torch.cat([constant, harmonics_along(offsets, degree)]) if degree else constant
+
+
+# -- solutions ---------------------------------------------------------------------------------------------------------
+
+
+def fitted(fits: ColourFits, degree: int) -> Float[Tensor, "n 3 N"]:
+    """Solves for the coefficients of a degree that change pictures least, minus the current constant ones."""
+    n = (degree + 1) ** 2
+    grams, products = fits.grams[:n, :n].permute(2, 0, 1), fits.products[:n].permute(2, 0, 1)
+    current = fits.current[:n].permute(2, 0, 1)
+    parts = zip(grams.split(CHUNK), products.split(CHUNK), current.split(CHUNK), strict=True)
+    return torch.cat([solved(*part) for part in parts]).permute(1, 2, 0)
+
+
+def solved(
+    grams: Float[Tensor, "N n n"], products: Float[Tensor, "N n 3"], current: Float[Tensor, "N n 3"]
+) -> Float[Tensor, "N n 3"]:
+    """Solves each row's system with the ridge; rows that no view shows keep their coefficients."""
+    mean = grams.diagonal(dim1=1, dim2=2).mean(1).clamp_min(torch.finfo(grams.dtype).tiny)[:, None, None]
+    ridge = RIDGE * torch.eye(grams.shape[1], dtype=grams.dtype, device=grams.device)
+    return torch.linalg.solve(grams / mean + ridge, products / mean + RIDGE * current)
+
+
+def squared_change(fits: ColourFits, coefficients: Float[Tensor, "n 3 N"]) -> Float[Tensor, "N"]:
+    """Returns the squared change of the pictures by these coefficients, summed over pixels and views."""
+    n = len(coefficients)
+    forward = torch.einsum("ijk,jck->ick", fits.grams[:n, :n], coefficients)
+    return (fits.norms + (coefficients * (forward - 2 * fits.products[:n])).sum((0, 1))).clamp_min(0)
+
+
+@torch.no_grad()
+def take_coefficients(table: ParameterTable, rows: Bool[Tensor, "N"], coefficients: Float[Tensor, "n 3 N"]) -> None:
+    """Assigns coefficients to marked rows; higher bands and all moments stay."""
+    new = coefficients.permute(2, 0, 1)[rows]
+    table["sh_dc"][rows] += new[:, :1]
+    table["sh_rest"][rows, : new.shape[1] - 1] = new[:, 1:]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -18,9 +18,21 @@ from gsx.core.errors import InputError
 from gsx.core.gaussians.bands import BAND_0
 from gsx.core.gaussians.sh import degree_of, harmonics
 from gsx.core.shapes import Float
-from gsx.formats.arrays import Arrays, finite_rows, joined
-from gsx.formats.gltf_asset import KINDS, Asset, Entry, asset_of, entry_at, glb_of, list_in, part_of, values_of, view_of
-from gsx.formats.gltf_nodes import moved, placed_meshes
+from gsx.formats.arrays import Arrays, finite_rows, joined, unit_quaternions
+from gsx.formats.gltf_asset import (
+    KINDS,
+    Asset,
+    Entry,
+    asset_of,
+    entry_at,
+    glb_of,
+    list_in,
+    moved,
+    part_of,
+    placed_meshes,
+    values_of,
+    view_of,
+)
 from gsx.formats.spz import decode_spz
 from gsx.formats.turned import DIRECTIONS, spread_directions
 
@@ -216,13 +228,11 @@ def arrays_of_attributes(found: dict[str, Float[np.ndarray, "N k"]]) -> Arrays:
         raise InputError("a scale is below 0, but scales are no logarithms in glTF: export it anew")
     if (opacities < -OVERSHOOT).any() or (opacities > 1 + OVERSHOOT).any():
         raise InputError("an opacity is beyond [0, 1], but opacities are no logits in glTF: export it anew")
-    norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    quats = np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [0.0, 0.0, 0.0, 1.0])
     rest = [found[name] for name in found if name not in REQUIRED]
     return Arrays(
         means=found[POSITION],
         log_scales=np.log(np.maximum(scales, SMALLEST_SCALE)),
-        quats=quats[:, [3, 0, 1, 2]],
+        quats=unit_quaternions(quats[:, [3, 0, 1, 2]]),
         opacities=opacities.clip(0, 1),
         sh_dc=found[CONSTANT],
         sh_rest=np.stack(rest, 1) if rest else np.empty((len(scales), 0, 3)),

@@ -1,4 +1,4 @@
-"""Documents, buffers and accessors of glTF 2.0, as GLB or as text with buffers (glTF specification, 3.6 and 4).
+"""Documents, buffers, accessors and nodes of glTF 2.0, as GLB or as text with buffers (glTF specification, 3.6 and 4).
 
 Damaged content raises InputError, which calls the file "it".
 """
@@ -7,16 +7,20 @@ import base64
 import binascii
 import json
 import struct
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
+import torch
 
 from gsx.core.errors import InputError
+from gsx.core.gaussians.quaternions import quaternions_of, rotation_matrices
 from gsx.core.shapes import Float
+from gsx.formats.arrays import Arrays
+from gsx.formats.turned import product, turned_harmonics
 
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 KINDS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -28,6 +32,13 @@ DATA_URI = "data:"
 COMPRESSED_VIEWS = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 """Extensions of buffer views with compressed values."""
 Entry = dict[str, Any]
+SHEAR = 1e-3
+"""Largest cosine between orthogonal axes of a node."""
+EQUAL = 1e-6
+"""Largest relative difference of equal scales."""
+ROUNDING = 1e-12
+"""Largest rounding error of a whole number."""
+IDENTITY = np.eye(4)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -235,3 +246,101 @@ def normalised(values: np.ndarray, accessor: Entry) -> Float[np.ndarray, "N k"]:
     if values.dtype.kind == "f" or accessor.get("normalized") is not True:
         return floats
     return np.maximum(floats / np.iinfo(values.dtype).max, -1)
+
+
+def placed_meshes(document: Entry) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
+    """Yields (index of a mesh, its matrix to the world) for each node with a mesh; the identity without nodes.
+
+    Raises:
+        InputError: nodes are no trees, or one is damaged.
+    """
+    if not list_in(document, "nodes"):
+        yield from ((mesh, IDENTITY) for mesh in range(len(list_in(document, "meshes"))))
+    pending = [(index, IDENTITY) for index in reversed(roots(document))]
+    visited: set[int] = set()
+    while pending:
+        index, world_from_parent = pending.pop()
+        node = entry_at(document, "nodes", index)
+        if index in visited:
+            raise InputError(f"its node {index} has two parents: export it anew")
+        visited.add(index)
+        with np.errstate(over="ignore", invalid="ignore"):  # `moved` refuses it
+            matrix = world_from_parent @ node_matrix(node)
+        if "mesh" in node:
+            yield node["mesh"], matrix
+        pending += [(child, matrix) for child in reversed(list_in(node, "children"))]
+
+
+def roots(document: Entry) -> list[int]:
+    """Returns the root nodes of the displayed scene; without scenes, nodes that are no children."""
+    if list_in(document, "scenes"):
+        return list_in(entry_at(document, "scenes", document.get("scene", 0)), "nodes")
+    nodes = range(len(list_in(document, "nodes")))
+    children = [child for index in nodes for child in list_in(entry_at(document, "nodes", index), "children")]
+    below = {child for child in children if type(child) is int}
+    return [index for index in nodes if index not in below]
+
+
+def node_matrix(node: Entry) -> Float[np.ndarray, "4 4"]:
+    """Returns the matrix from a node to its parent: as stored by columns, or by translation, rotation and scale."""
+    if "matrix" in node:
+        return numbers_in(node, "matrix", IDENTITY.flatten().tolist()).reshape(4, 4).T
+    x, y, z, w = numbers_in(node, "rotation", (0.0, 0.0, 0.0, 1.0))
+    matrix = np.eye(4)
+    turn = rotation_matrices(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy()
+    matrix[:3, :3] = turn * numbers_in(node, "scale", (1.0, 1.0, 1.0))
+    matrix[:3, 3] = numbers_in(node, "translation", (0.0, 0.0, 0.0))
+    return matrix
+
+
+def moved(arrays: Arrays, matrix: Float[np.ndarray, "4 4"]) -> Arrays:
+    """Maps every point p of splats to `matrix` (p, 1); colours turn (KHR_gaussian_splatting, "Splat Lighting").
+
+    Raises:
+        InputError: the matrix is no rotation after positive scales, and translation.
+    """
+    if not np.abs(matrix).max() < LARGEST:
+        raise InputError("a node lies beyond all numbers: export it with its transform applied")
+    if np.abs(matrix - IDENTITY).max() < ROUNDING:
+        return arrays
+    linear, scale = matrix[:3, :3], np.linalg.norm(matrix[:3, :3], axis=0)
+    turn = torch.from_numpy(unscaled(linear, scale))
+    if float(scale.max() - scale.min()) <= EQUAL * float(scale.max()):
+        log_scales = arrays.log_scales + np.log(scale.mean())
+        quats = product(quaternions_of(turn[None])[0], torch.from_numpy(arrays.quats)).numpy()
+    else:
+        log_scales, quats = stretched(arrays, linear)
+    rest = arrays.sh_rest
+    if arrays.degree:
+        rest = sharpened(turned_harmonics(turn, arrays.degree).numpy()) @ rest
+    means = arrays.means @ linear.T + matrix[:3, 3]
+    return replace(arrays, means=means, log_scales=log_scales, quats=quats, sh_rest=rest)
+
+
+def unscaled(linear: Float[np.ndarray, "3 3"], scale: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Returns the rotation of a node from its columns of lengths `scale`."""
+    if scale.min() < 1 / LARGEST:
+        raise InputError("a node has a scale of 0: export it with its transform applied")
+    axes = linear / scale
+    if np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR:
+        raise InputError("a node shears its splats, which is not read: export it with its transform applied")
+    if np.linalg.det(axes) < 0:
+        raise InputError("a node mirrors its splats, which is not read: export it with its transform applied")
+    left, _, right = np.linalg.svd(axes)
+    return sharpened(left @ right)
+
+
+def sharpened(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Rounds entries within ROUNDING of whole numbers."""
+    return np.where(np.abs(matrix - matrix.round()) < ROUNDING, matrix.round(), matrix)
+
+
+def stretched(
+    arrays: Arrays, linear: Float[np.ndarray, "3 3"]
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 4"]]:
+    """Returns (log-scales, quaternions) of splats with covariance C C^T after a linear map M, by the SVD of M C."""
+    own = rotation_matrices(torch.from_numpy(arrays.quats)).numpy() * np.exp(arrays.log_scales)[:, None]
+    left, scales, _ = np.linalg.svd(linear @ own)
+    left[:, :, 2] *= np.sign(np.linalg.det(left))[:, None]
+    quats = quaternions_of(torch.from_numpy(left)).numpy()
+    return np.log(np.maximum(scales, np.finfo(float).tiny)), quats

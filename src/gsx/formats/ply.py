@@ -1,7 +1,7 @@
 """PLY files: tables of scalars by element, such as vertices of splats and of point clouds (3D-GS, save_ply).
 
 Reads ascii and both binary byte orders, writes binary little-endian. Skips other elements, also with lists, such as
-faces. Damaged content raises InputError, which calls the file "it".
+faces. Colours have the names and units that programs use. Damaged content raises InputError, which calls the file "it".
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,6 +27,15 @@ HEADER_END = b"\nend_header"
 """Last line of a header."""
 MOST_DIGITS = 15
 """Most digits of a number of rows."""
+COLOUR_NAMES = (
+    ("red", "green", "blue"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("r", "g", "b"),
+    ("R", "G", "B"),
+)
+"""Names of the three channels, the usual ones first (diffuse_: MeshLab and older scanners)."""
+OVERSHOOT = 0.5
+"""Floats in [0, 1] may exceed it by this, because colours of harmonics are not clipped."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,21 +238,13 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
 
     Raises:
         InputError: the file cannot be written.
-        ValueError: the arrays differ in length, have more than one dimension, or a type that PLY lacks.
+        ValueError: the arrays differ in length.
     """
-    path = Path(path)
-    counts = {column.shape for column in columns.values()}
-    if len(counts) != 1 or len(next(iter(counts))) != 1:
-        raise ValueError(f"PLY columns need one dimension and one length, got shapes {sorted(counts)}")
     names = {code: name for name, code in reversed(TYPES.items())}
     codes = {name: column.dtype.str[1:] for name, column in columns.items()}
-    if not set(codes.values()) <= set(names):
-        raise ValueError(f"PLY knows the types {', '.join(names)}, got {codes}")
-    rows = np.empty(next(iter(counts)), np.dtype([(name, f"<{code}") for name, code in codes.items()]))
-    for name, column in columns.items():
-        rows[name] = column
+    rows = np.rec.fromarrays(list(columns.values()), np.dtype([(name, f"<{code}") for name, code in codes.items()]))
     header = header_of({VERTICES: (len(rows), {name: names[code] for name, code in codes.items()})}, comments)
-    write_whole(path, header + rows.tobytes())
+    write_whole(Path(path), header + rows.tobytes())
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -265,3 +266,27 @@ def header_of(elements: Mapping[str, tuple[int, Mapping[str, str]]], comments: I
 def plain(comment: str) -> str:
     """Returns a comment as one line of ASCII; other characters become escapes."""
     return " ".join(comment.split()).encode("ascii", "backslashreplace").decode()
+
+
+def colours_among(columns: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Returns the colour columns [N, 3] as stored; None: there are none."""
+    for names in COLOUR_NAMES:
+        if set(names) <= columns.keys():
+            return np.stack([columns[name] for name in names], axis=1)
+    return None
+
+
+def full_scale_of(values: np.ndarray) -> float | None:
+    """Returns the value of full intensity by type and range; None: unknown unit.
+
+    Bytes have 255, other integers 255 or 65,535, floats 1 within OVERSHOOT of [0, 1], else 255.
+    """
+    finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+    if values.dtype == np.uint8 or not finite.size:
+        return 255.0 if values.dtype.kind in "iu" else 1.0
+    least, most = float(finite.min()), float(finite.max())
+    if values.dtype.kind == "f":
+        if least >= -OVERSHOOT and most <= 1 + OVERSHOOT:
+            return 1.0
+        return 255.0 if least >= 0 and most <= 255 else None
+    return next((full for full in (255.0, 65535.0) if least >= 0 and most <= full), None)

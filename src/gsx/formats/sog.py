@@ -11,13 +11,17 @@ import zipfile
 from typing import Any
 
 import numpy as np
+import torch
 
 from gsx.core.packages import require
 from gsx.core.shapes import Float, Int, UInt8
 from gsx.formats.arrays import Arrays, rounded, smallest_three
-from gsx.formats.clusters import nearest_number, number_book, vector_book
 from gsx.formats.compressed_ply import morton_order
 
+NUMBER_ROUNDS, VECTOR_ROUNDS = 20, 8
+"""Rounds of Lloyd's algorithm."""
+CHUNK_VALUES = 1 << 24
+"""Distances held at once."""
 VERSION = 2
 BOOK = 256
 """Entries of a code book of numbers."""
@@ -27,6 +31,46 @@ FIRST_LARGEST = 252
 """Alpha of a quaternion whose first component is the largest."""
 HIGHER = ("shN_centroids.webp", "shN_labels.webp")
 COEFFICIENTS = {1: 3, 2: 8, 3: 15}
+
+
+def number_book(values: Float[np.ndarray, "V"], size: int) -> Float[np.ndarray, "size"]:
+    """Returns an ascending code book by k-means, from quantiles (dense values) and even steps (sparse ones)."""
+    ordered, half = np.sort(values), size // 2
+    even = np.linspace(ordered[0], ordered[-1], size - half)
+    book = np.sort(np.concatenate([np.quantile(ordered, (np.arange(half) + 0.5) / half), even]))
+    sums = np.concatenate([[0.0], np.cumsum(ordered)])
+    for _ in range(NUMBER_ROUNDS):
+        ends = np.concatenate([[0], np.searchsorted(ordered, (book[1:] + book[:-1]) / 2), [len(ordered)]])
+        counts = np.diff(ends)
+        book = np.where(counts > 0, (sums[ends[1:]] - sums[ends[:-1]]) / np.maximum(counts, 1), book)
+    return book
+
+
+def nearest_number(values: Float[np.ndarray, "..."], book: Float[np.ndarray, "size"]) -> Int[np.ndarray, "..."]:
+    """Returns the index of the nearest number in an ascending book."""
+    return np.searchsorted((book[1:] + book[:-1]) / 2, values)
+
+
+def vector_book(
+    vectors: Float[np.ndarray, "N D"], size: int
+) -> tuple[Float[np.ndarray, "size D"], Int[np.ndarray, "N"]]:
+    """Returns (code book, row of the nearest entry of each vector) by k-means from evenly spaced rows."""
+    points = torch.from_numpy(vectors.astype(np.float32))
+    book = points[torch.arange(size) * len(points) // size].clone()
+    labels = nearest_vector(points, book)
+    for _ in range(VECTOR_ROUNDS if size < len(points) else 0):
+        counts = torch.bincount(labels, minlength=size)
+        sums = torch.zeros_like(book).index_add_(0, labels, points)
+        book = torch.where(counts[:, None] > 0, sums / counts.clamp_min(1)[:, None], book)
+        labels = nearest_vector(points, book)
+    return book.numpy().astype(float), labels.numpy()
+
+
+def nearest_vector(points: Float[torch.Tensor, "N D"], book: Float[torch.Tensor, "K D"]) -> Int[torch.Tensor, "N"]:
+    """Returns the row of the nearest vector in a book."""
+    squares = book.square().sum(1)
+    rows = max(1, CHUNK_VALUES // len(book))
+    return torch.cat([(squares - 2 * part @ book.T).argmin(1) for part in points.split(rows)])
 
 
 def encode_sog(arrays: Arrays, antialiased: bool = False) -> bytes:

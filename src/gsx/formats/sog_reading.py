@@ -8,11 +8,12 @@ InputError, which calls the file "it".
 import io
 import json
 import logging
+import struct
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,12 +21,15 @@ from gsx.core.errors import InputError
 from gsx.core.packages import require
 from gsx.core.shapes import Float, UInt8
 from gsx.formats.arrays import Arrays, from_smallest_three
-from gsx.formats.pixels import MOST_SIDE, header_of
 from gsx.formats.sog import BOOK, COEFFICIENTS, FIRST_LARGEST, PALETTE, VERSION
 from gsx.formats.suffixes import META, MOST_META
 
+MOST_SIDE = 16383
+"""Longest side of a WebP, px."""
+PNG = b"\x89PNG\r\n\x1a\n"
+MOST_CHUNKS = 64
+"""Most chunks of a WebP before its pixels."""
 logger = logging.getLogger(__name__)
-
 MOST_SPLATS = 1 << 26
 SPARE_PIXELS = 1 << 22
 """Most pixels of a picture beyond four times the splats."""
@@ -34,6 +38,51 @@ MODELS = (COMPENSATED, FLAT, "default")
 """Values of `model`."""
 BYTES_PER_PIXEL = 8
 """Bound of the bytes per pixel of any encoder."""
+
+
+class PictureHeader(NamedTuple):
+    """Header of a picture."""
+
+    width: int
+    height: int
+    lossless: bool
+
+
+def header_of(content: bytes, name: str) -> PictureHeader:
+    """Returns the header of a still picture."""
+    try:
+        if content.startswith(PNG):
+            width, height, depth = struct.unpack_from(">IIB", content, 16)
+            if content[12:16] != b"IHDR" or depth != 8:
+                raise InputError(f"'{name}' is no PNG of 8 bits: export it anew")
+            return PictureHeader(width, height, lossless=True)
+        if content[:4] == b"RIFF" and content[8:12] == b"WEBP":
+            return webp_header(content, name)
+    except struct.error:
+        raise InputError(f"'{name}' ends within its header: copy or export it anew") from None
+    raise InputError(f"'{name}' is neither WebP nor PNG: export it anew")
+
+
+def webp_header(content: bytes, name: str) -> PictureHeader:
+    """Returns the header of a WebP from its first chunk of pixels; errors as `header_of`."""
+    at, canvas = 12, None
+    for _ in range(MOST_CHUNKS):
+        kind, size = struct.unpack_from("<4sI", content, at)
+        if kind == b"VP8X":
+            canvas = tuple(1 + int.from_bytes(content[at + first : at + first + 3], "little") for first in (12, 15))
+        elif kind in (b"VP8L", b"VP8 "):
+            if kind == b"VP8L":
+                _, packed = struct.unpack_from("<BI", content, at + 8)
+                sides = 1 + (packed & 16383), 1 + (packed >> 14 & 16383)
+            else:
+                sides = tuple(side & 16383 for side in struct.unpack_from("<HH", content, at + 14))
+            if canvas not in (None, sides):
+                raise InputError(f"'{name}' has a canvas of other size than its pixels: export it anew")
+            return PictureHeader(*sides, lossless=kind == b"VP8L")
+        elif kind in (b"ANIM", b"ANMF"):
+            raise InputError(f"'{name}' is an animation: export it anew")
+        at += 8 + size + size % 2
+    raise InputError(f"'{name}' has no pixels: copy or export it anew")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

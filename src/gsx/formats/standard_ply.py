@@ -16,8 +16,7 @@ from gsx.core.gaussians.sh import constant_from_colour
 from gsx.core.gaussians.splats import Gaussians
 from gsx.core.shapes import Float
 from gsx.formats.arrays import SMALLEST_OPACITY, finite_rows
-from gsx.formats.colours import COLOUR_NAMES, colours_among, full_scale_of
-from gsx.formats.ply import header_in, vertices_of
+from gsx.formats.ply import COLOUR_NAMES, colours_among, full_scale_of, header_in, vertices_of
 from gsx.formats.smoothing import smoothed_raw
 
 logger = logging.getLogger(__name__)

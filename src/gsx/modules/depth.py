@@ -14,7 +14,6 @@ from typing import Annotated, Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import Depths, Scene, View
@@ -28,6 +27,7 @@ from gsx.core.training.backbone import behind_scene
 from gsx.core.training.module import ModuleContext, TrainingModule
 from gsx.core.training.run import Run
 from gsx.core.training.schedule import log_linear
+from gsx.modules.alignment import sample_image
 from gsx.modules.corrections import WHEN
 
 logger = logging.getLogger(__name__)
@@ -141,7 +141,7 @@ class Depth(TrainingModule):
         places = moved(depths.pixels, own, camera)
         pixels, z, weights = (upload(values, run.device) for values in (places, depths.z, counting))
         target = z if self.options.domain == "depth" else 1 / z
-        first, second = sampled(blended, pixels)
+        first, second = sample_image(blended, pixels.T, "bilinear")
         errors = spread_errors(first, second, target) if whole else mean_errors(first, second, target)
         weight = log_linear(step, self.context.iterations, self.options.weight, self.options.weight_final)
         return weight / target.median() * (weights * errors).sum() / weights.sum().clamp_min(1)
@@ -158,9 +158,11 @@ class Depth(TrainingModule):
 
 def measured_depths(scene: Scene, source: str) -> tuple[dict[str, Depths], dict[str, Depths]]:
     """Returns the depths of views from maps, and those of other views from points, by name of the view."""
-    maps = (
-        {} if source == "points" else {view.name: depths_of_map(depth, view.name) for view, depth in depth_maps(scene)}
-    )
+    maps = dict[str, Depths]()
+    for view, depth in () if source == "points" else depth_maps(scene):
+        generator = torch.Generator().manual_seed(derived_seed("depth", view.name))
+        places, z = random_depths(depth, depth > 0, MOST_PLACES, generator)
+        maps[view.name] = Depths(pixels=places, z=z, weights=torch.ones(len(z)))
     others = [] if source == "maps" else [view for view in scene.train if view.name not in maps]
     points = {view.name: view.sparse for view in others if view.sparse is not None and len(view.sparse.z)}
     return maps, points
@@ -184,13 +186,6 @@ def depth_maps(scene: Scene) -> Iterator[tuple[View, Float[Tensor, "H W"]]]:
             "scene.depth_values (depth or disparity) and scene.depth_unit, or set scene.depth_fit=none for metric maps "
             "of a scene without points"
         )
-
-
-def depths_of_map(depth: Float[Tensor, "H W"], name: str) -> Depths:
-    """Returns up to MOST_PLACES depths of a view's map, at random pixels."""
-    generator = torch.Generator().manual_seed(derived_seed("depth", name))
-    places, z = random_depths(depth, depth > 0, MOST_PLACES, generator)
-    return Depths(pixels=places, z=z, weights=torch.ones(len(z)))
 
 
 def random_depths(
@@ -238,13 +233,6 @@ def counted_at(pixels: Float[Tensor, "K 2"], counted: Bool[Tensor, "H W"] | None
     height, width = counted.shape
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     return inside & counted[row.clamp(0, height - 1), column.clamp(0, width - 1)]
-
-
-def sampled(channels: Float[Tensor, "C H W"], pixels: Float[Tensor, "K 2"]) -> Float[Tensor, "C K"]:
-    """Returns channels at places, px, by bilinear interpolation between pixel centres."""
-    size = pixels.new_tensor([channels.shape[2], channels.shape[1]])
-    places = (2 * pixels / size - 1)[None, None]
-    return grid_sample(channels[None], places, padding_mode="border", align_corners=False)[0, :, 0]
 
 
 def spread_errors(

@@ -169,7 +169,9 @@ def movement_between(
         return Movement(0.0, 0.0, explained=0.0)
     source, target, weight = sharp.mean(0), photo.mean(0), None if mask is None else interior_weights(mask)
     spectra = spectra_of(source, target, weight)
-    movement = descend(best([(0.0, 0.0), *first_movements()], spectra), spectra)
+    turns = [math.pi * turn / DIRECTIONS for turn in range(DIRECTIONS)]
+    first = [(length * math.cos(turn), length * math.sin(turn)) for length in LENGTHS for turn in turns]
+    movement = descend(best([(0.0, 0.0), *first], spectra), spectra)
     if mask is not None:
         for _ in range(ROUNDS):
             filled = torch.where(mask, target, motion_blurred(source[None], *movement)[0])
@@ -284,12 +286,6 @@ def descend(start: tuple[float, float], spectra: Spectra) -> tuple[float, float]
         step = step / 2 if better == where else step
         where = better
     return where
-
-
-def first_movements() -> list[tuple[float, float]]:
-    """Returns movements of LENGTHS in DIRECTIONS."""
-    turns = [math.pi * turn / DIRECTIONS for turn in range(DIRECTIONS)]
-    return [(length * math.cos(turn), length * math.sin(turn)) for length in LENGTHS for turn in turns]
 
 
 def neighbours(where: tuple[float, float], step: float) -> list[tuple[float, float]]:

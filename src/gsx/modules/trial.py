@@ -23,16 +23,15 @@ from gsx.core.plugins import load_plugins
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Bool, Float
 from gsx.core.training.module import ModuleContext, TrainingModule
+from gsx.core.training.parameter_table import RECORD, restore_table, table_tensors
 from gsx.core.training.render import render
 from gsx.core.training.run import Run
 from gsx.core.training.trainer import train_step
 from gsx.core.training.validation import decibels, validation_windows
-from gsx.modules.corrections import Correction
+from gsx.modules.corrections import Correction, ViewCache
 from gsx.modules.derived_views import mask_view
-from gsx.modules.run_state import RunState, finite, return_to, state_of
 
 logger = logging.getLogger(__name__)
-
 GAIN, ERROR = "_trial", "_error"
 """Ends of the keys of a gain and its standard error in metrics.jsonl."""
 SURE = 2
@@ -41,6 +40,57 @@ MOST_MASKED = 1 / 3
 """Largest share of the training views with a masked window."""
 MIN_STEPS = 10
 """Fewest steps of a stretch: in shorter runs tests alone decide."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunState:
+    """Content of a checkpoint, in memory."""
+
+    step: int
+    table: Mapping[str, Tensor]
+    """Tensors of the model by their names in checkpoints."""
+    modules: Mapping[str, Mapping[str, Tensor]]
+    """Tensors of each module."""
+    generator: Tensor
+    """State of the run's generator."""
+    order: tuple[int, ...]
+    """Indices left in the sampler's order."""
+    orders: int
+    """Number of orders drawn."""
+
+
+def copied(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Returns copies of tensors."""
+    return {name: value.detach().clone() for name, value in tensors.items()}
+
+
+def state_of(run: Run) -> RunState:
+    """Copies the state of a run."""
+    return RunState(
+        step=run.step,
+        table=copied(table_tensors(run.backbone.table)),
+        modules={name: copied(module.state_dict()) for name, module in run.modules.items()},
+        generator=run.generator.get_state(),
+        order=tuple(run.sampler.order),
+        orders=run.sampler.orders,
+    )
+
+
+def return_to(run: Run, state: RunState) -> None:
+    """Brings a run back to a state; the state stays usable."""
+    table = run.backbone.table
+    table.record = {name: entry for name, entry in table.record.items() if RECORD + name in state.table}
+    run.backbone.table = restore_table(table, copied(state.table))
+    for name, module in run.modules.items():
+        module.load_state_dict(copied(state.modules[name]))
+    run.generator.set_state(state.generator)
+    run.sampler.order, run.sampler.orders = list(state.order), state.orders
+    run.step = state.step
+
+
+def finite(run: Run) -> bool:
+    """Checks that all parameters of a run's model are finite."""
+    return all(bool(torch.isfinite(value).all()) for value in run.backbone.table.parameters.values())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,8 +137,8 @@ class Trial(TrainingModule):
         super().__init__(options, context)
         self.windows: Mapping[int, Window] = {}
         """Masked windows by number of their view, during a trial."""
-        self.masked: tuple[Sequence[View], Sequence[View]] | None = None
-        """Views before and after masking, of the last call."""
+        self.cache = ViewCache()
+        """Masked views."""
 
     # -- masked windows ------------------------------------------------------------------------------------------------
 
@@ -96,13 +146,8 @@ class Trial(TrainingModule):
         """Returns the views with masked windows during a trial."""
         if not self.windows:
             return views
-        if self.masked is None or self.masked[0] is not views:
-            self.masked = views, [self.mask(view, self.windows.get(index)) for index, view in enumerate(views)]
-        return self.masked[1]
-
-    def mask(self, view: View, window: Window | None) -> View:
-        """Returns the view with a masked window of its photo."""
-        return view if window is None else mask_view(view, masked_pixels(view, window))
+        windows = self.windows
+        return self.cache.get(views, lambda: [masked(view, windows.get(index)) for index, view in enumerate(views)])
 
     def choose_windows(self, run: Run, step: int) -> dict[int, Window]:
         """Picks windows of some views, in pixels of the photos."""
@@ -113,7 +158,7 @@ class Trial(TrainingModule):
 
     def set_windows(self, windows: Mapping[int, Window]) -> None:
         """Masks these windows, or none."""
-        self.windows, self.masked = windows, None
+        self.windows, self.cache = windows, ViewCache()
 
     # -- trials --------------------------------------------------------------------------------------------------------
 
@@ -231,11 +276,13 @@ class Trial(TrainingModule):
             )
 
 
-def masked_pixels(view: View, window: Window) -> Bool[Tensor, "H W"]:
-    """Marks the pixels of a window of a photo."""
-    out = torch.zeros(view.camera.frame.height, view.camera.frame.width, dtype=torch.bool)
-    out[window.pixels] = True
-    return out
+def masked(view: View, window: Window | None) -> View:
+    """Returns the view with a masked window of its photo."""
+    if window is None:
+        return view
+    pixels = torch.zeros(view.camera.frame.height, view.camera.frame.width, dtype=torch.bool)
+    pixels[window.pixels] = True
+    return mask_view(view, pixels)
 
 
 def settle(tested: Sequence[Correction], step: int) -> None:

@@ -21,8 +21,17 @@ from gsx.core.seeds import derived_seed
 from gsx.core.shapes import Float
 from gsx.core.training.regenerator import RegeneratorContext, Request
 from gsx.regenerators.classical import refuse_enlarging
-from gsx.regenerators.networks import fit, initialise, read_tensors, write_tensors
-from gsx.regenerators.pairs import Pair, held_out_pairs, mean_square, random_part, with_own
+from gsx.regenerators.networks import (
+    Pair,
+    fit,
+    held_out_pairs,
+    initialise,
+    mean_square,
+    random_part,
+    read_tensors,
+    with_own,
+    write_tensors,
+)
 
 logger = logging.getLogger(__name__)
 

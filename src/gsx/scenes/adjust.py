@@ -15,8 +15,7 @@ from gsx.scenes.bundle import SHIFT, bundle_adjusted
 from gsx.scenes.cached_models import cached_model
 from gsx.scenes.camera_groups import Proposal, proposal
 from gsx.scenes.colmap_model import Model, read_model
-from gsx.scenes.keypoint_fit import shift_of
-from gsx.scenes.observations import unmeasured
+from gsx.scenes.keypoint_fit import shift_of, unmeasured
 from gsx.scenes.shared_cameras import (
     Decision,
     camera_key,

@@ -20,18 +20,16 @@ from gsx.core.files import expand_home
 from gsx.core.ranges import Length, Points, Range, Seed
 from gsx.core.shapes import UInt8
 from gsx.formats.origin import in_words
-from gsx.scenes.duplicates import photos_of
 from gsx.scenes.frame_files import TEST_FILES, TRAIN_FILE, is_empty, needs_lens, test_file
 from gsx.scenes.lenses import angle_of, beyond_angle, states_lens
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.origin import focus_of, origin_of_cameras
-from gsx.scenes.photo_names import plain_name
 from gsx.scenes.photo_source import PhotoSource
 from gsx.scenes.points import random_points, stored_points
-from gsx.scenes.pose_files import frames_line, pose_from_opengl, present_frames, read_frames
+from gsx.scenes.pose_files import frames_line, plain_name, pose_from_opengl, present_frames, read_frames
 from gsx.scenes.posed import Shot, check_sides, scene_of, views_of
-from gsx.scenes.splits import short, split_names
+from gsx.scenes.splits import photos_of, short, split_names
 
 POINTS_FILE = "points3d.ply"  # where 3D-GS caches its random cloud, and conversions put a real one
 

@@ -2,7 +2,7 @@
 
 import copy
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -137,16 +137,34 @@ def adjust(model: Any, folder: Path, *, focal: bool = True, tolerance: float = 0
 
 def with_distortion(model: Any, straight: Sequence[int]) -> Any:
     """Return a copy in which cameras of these numbers have distortion parameters, which are 0."""
-    import pycolmap
-
     out = copy.deepcopy(model)
     for camera in (out.cameras[number] for number in straight):
-        wider = pycolmap.Camera.create_from_model_name(
-            camera.camera_id, BENT[camera.model_name], 1.0, camera.width, camera.height
-        )
-        params = [*camera.params, *[0.0] * (len(wider.params) - len(camera.params))]
-        camera.model, camera.params = wider.model, params
+        wider = widened(camera, BENT)
+        camera.model, camera.params = wider.model, wider.params
     return out
+
+
+def widened(camera: Any, models: Mapping[str, str]) -> Any:
+    """Return a pycolmap camera of a model with more distortion, which is 0; itself if `models` does not name one."""
+    import pycolmap
+
+    if camera.model_name not in models:
+        return camera
+    focal = camera.mean_focal_length()
+    wider = pycolmap.Camera.create_from_model_name(
+        camera.camera_id, models[camera.model_name], focal, camera.width, camera.height
+    )
+    params: Any = np.array(wider.params)
+    params[wider.principal_point_idxs()] = centre_of(camera)
+    if len(wider.focal_length_idxs()) == len(camera.focal_length_idxs()):
+        params[wider.focal_length_idxs()] = camera.params[camera.focal_length_idxs()]
+    wider.params = params
+    return wider
+
+
+def centre_of(camera: Any) -> Float[np.ndarray, "2"]:
+    """Return the principal point of a pycolmap camera."""
+    return np.array([camera.principal_point_x, camera.principal_point_y])
 
 
 def bend_of(model: Any, cameras: Sequence[int]) -> float:

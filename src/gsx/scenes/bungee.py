@@ -28,13 +28,12 @@ from gsx.core.ranges import Points, Seed
 from gsx.core.shapes import Float
 from gsx.scenes import colmap
 from gsx.scenes.colmap_folders import model_folders
-from gsx.scenes.duplicates import photos_of
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.origin import origin_of_cameras, relative_camera
 from gsx.scenes.points import grey_points, stored_points
 from gsx.scenes.pose_files import finite_number, pose_from_opengl, read_json
 from gsx.scenes.posed import Shot, check_sides, scene_of, views_of
-from gsx.scenes.splits import Split, positive, short, split_names
+from gsx.scenes.splits import Split, photos_of, positive, short, split_names
 
 POSES_FILE = "poses_enu.json"
 POSE_VALUES = 17  # 3 x 5 [R | t | height, width, focal], near, far

@@ -30,15 +30,13 @@ from gsx.scenes.colmap_folders import (
     photo_folders_above,
 )
 from gsx.scenes.colmap_model import Model, ModelImage, error_words, read_model
-from gsx.scenes.duplicates import photos_of, refuse_file_twice
+from gsx.scenes.keypoint_fit import Unmeasured, counted, known, straight_keypoints, with_rays
 from gsx.scenes.masked import IMAGES, mask_notes
-from gsx.scenes.observations import Unmeasured, counted, known, straight_keypoints, with_rays
 from gsx.scenes.options import SceneOptions, refuse_other
 from gsx.scenes.orientation import RULES, TurnsOf, of_model, oriented_size
-from gsx.scenes.photo_names import similar_photo
-from gsx.scenes.pose_files import refuse_partial, some_names
+from gsx.scenes.pose_files import refuse_partial, similar_photo, some_names
 from gsx.scenes.posed import MIN_IMAGES, Shot, check_sides, scene_of, shot_notes, shot_through, views_of
-from gsx.scenes.splits import split_names
+from gsx.scenes.splits import photos_of, refuse_file_twice, split_names
 from gsx.scenes.undistort import METHOD, pinhole_of
 
 MIN_VISIBLE_FRACTION = 0.5  # of the points, where the model keeps no observations that could be compared instead

@@ -19,9 +19,9 @@ from gsx.core.shapes import Float
 from gsx.scenes.filling import in_front, in_view
 from gsx.scenes.masked import candidates, folder_of
 from gsx.scenes.options import SceneOptions
-from gsx.scenes.orientation import Remap, Turned, oriented
+from gsx.scenes.orientation import Remap, Turned
 from gsx.scenes.photo_source import PhotoSource
-from gsx.scenes.undistort import StoredUndistortion, undistort_nearest
+from gsx.scenes.undistort import StoredUndistortion
 
 FOLDER = "depths"
 """Folder of maps, at the place of a folder of masks."""
@@ -95,11 +95,10 @@ def read_map(file: Path, source: PhotoSource, options: SceneOptions) -> Float[Te
 
 def straightened(values: Float[Tensor, "h w"], remap: Remap | None) -> Float[Tensor, "H W"]:
     """Turn and undistort a map as its photograph, without interpolation; 0 where it has no value."""
-    if isinstance(remap, Turned):
-        for orientation in remap.first:
-            values = oriented(values[None], orientation)[0]
-        return oriented(straightened(values, remap.remap)[None], remap.last)[0]
-    return undistort_nearest(values, remap) if isinstance(remap, StoredUndistortion) else values
+    inner = remap.remap if isinstance(remap, Turned) else remap
+    nearest = inner.nearest if isinstance(inner, StoredUndistortion) else None
+    change = replace(remap, remap=nearest) if isinstance(remap, Turned) else nearest
+    return values if change is None else change(values[None])[0]
 
 
 def nearest_values(values: Float[Tensor, "h w"], width: int, height: int) -> Float[Tensor, "height width"]:

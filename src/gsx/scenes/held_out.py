@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gsx.core.shapes import Float
-from gsx.scenes.bundle import BENT, adjust, registered
+from gsx.scenes.bundle import BENT, adjust, centre_of, registered, widened
 from gsx.scenes.keypoint_fit import LEAST
 
 logger = logging.getLogger(__name__)
@@ -146,24 +146,6 @@ def scaled(camera: Any, by: float) -> Float[np.ndarray, "P"]:
     return params
 
 
-def widened(camera: Any, models: Mapping[str, str]) -> Any:
-    """Return a pycolmap camera of a model with more distortion, which is 0; itself if `models` does not name one."""
-    import pycolmap
-
-    if camera.model_name not in models:
-        return camera
-    focal = camera.mean_focal_length()
-    wider = pycolmap.Camera.create_from_model_name(
-        camera.camera_id, models[camera.model_name], focal, camera.width, camera.height
-    )
-    params: Any = np.array(wider.params)
-    params[wider.principal_point_idxs()] = centre_of(camera)
-    if len(wider.focal_length_idxs()) == len(camera.focal_length_idxs()):
-        params[wider.focal_length_idxs()] = camera.params[camera.focal_length_idxs()]
-    wider.params = params
-    return wider
-
-
 def with_own_radial(source: Any, shared: Any, candidate: Candidate, left_out: frozenset[Point]) -> Any:
     """Return an adjusted model with a camera for each of the source's, of the shared focal length, with distortion."""
     images, numbers = {}, dict[tuple[Hashable, int], int]()
@@ -240,11 +222,6 @@ def pixels_of(image: Any) -> Float[np.ndarray, "K 2"]:
     return np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
 
 
-def centre_of(camera: Any) -> Float[np.ndarray, "2"]:
-    """Return the principal point of a pycolmap camera."""
-    return np.array([camera.principal_point_x, camera.principal_point_y])
-
-
 # -- comparison --------------------------------------------------------------------------------------------------------
 
 
@@ -267,11 +244,11 @@ def candidate_errors(
     source: Any, candidate: Candidate, folder: Path, parts: Sequence[Mapping[Point, int]]
 ) -> Float[np.ndarray, "H"]:
     """Return distances of the held-out keypoints of all parts, px, after an adjustment without each part in turn."""
-    errors = []
+    errors, scales = [], scales_of(source, candidate)
     for held in parts:
         logger.info("bundle adjustment of cameras %s, %d keypoints held out", candidate.name, len(held))
         work = adjusted(source, candidate, folder, frozenset(held))
-        errors.append(held_errors(work, held) / held_scales(source, candidate, held))
+        errors.append(held_errors(work, held) / np.array([scales[at] for at, _ in held]))
     return np.concatenate(errors)
 
 
@@ -317,12 +294,6 @@ def held_errors(work: Any, held: Mapping[Point, int]) -> Float[np.ndarray, "H"]:
         pixel = image.camera.img_from_cam(point) if point[2] > 0 else None
         errors.append(math.inf if pixel is None else float(np.linalg.norm(pixel - image.point2D(index).xy)))
     return np.array(errors)
-
-
-def held_scales(source: Any, candidate: Candidate, held: Mapping[Point, int]) -> Float[np.ndarray, "H"]:
-    """Return the factor from each held-out keypoint's pixels to the common raster."""
-    scales = scales_of(source, candidate)
-    return np.array([scales[at] for at, _ in held])
 
 
 def result(

@@ -1,24 +1,76 @@
 """Fit of a model's cameras to its keypoints: the movement of a whole picture, and the focal length of each photo.
 
 A wrong pose, focal length or lens shifts the keypoints of a picture together; noise shifts each on its own. To separate
-them, a movement is fitted to every other keypoint of an image and has to predict those in between.
+them, a movement is fitted to every other keypoint of an image and has to predict those in between. Keypoints without a
+ray and points behind a camera are counted.
 """
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsx.core.shapes import Float
+from gsx.core.shapes import Bool, Float
 from gsx.scenes.colmap_model import Model, ModelImage
-from gsx.scenes.observations import known, straight_keypoints
-from gsx.scenes.undistort import pinhole_of
+from gsx.scenes.pose_files import some_names
+from gsx.scenes.undistort import pinhole_of, rays_of, undistort_points
 
 LEAST = 32  # observations of an image from which its movement is estimated
 FLAT = 1e3  # a point farther to the side than so many times its depth lies in the plane of the camera's centre
 REWEIGHTED = 5  # fits with robust weights from the residuals of the last one
 FOCAL = 6  # column of the focal length among `movements`
+
+
+@dataclass(frozen=True)
+class Unmeasured:
+    """Numbers of observations that are left out, or infinitely wrong."""
+
+    no_ray: int = 0
+    """Keypoints for which the lens has no ray, or that are not finite."""
+    behind: int = 0
+    """Observed points behind their camera."""
+    blind: tuple[str, ...] = ()
+    """Images without a keypoint that has a ray."""
+
+    def __str__(self) -> str:
+        """Return clauses to append to a sentence; an empty string if all observations are measured."""
+        no_ray = f"; keypoints for which the lens has no ray, left out: {self.no_ray}" if self.no_ray else ""
+        blind = f"; no keypoint is left of {some_names(self.blind)}" if self.blind else ""
+        behind = f"; observed points that lie behind their camera: {self.behind}" if self.behind else ""
+        return no_ray + blind + behind
+
+
+def straight_keypoints(image: ModelImage, intrinsics: Any) -> Float[Tensor, "K 2"]:
+    """Return keypoints in px of the pinhole of `intrinsics`, a pycolmap camera; NaN for those without a ray."""
+    return undistort_points(intrinsics, pinhole_of(intrinsics), image.keypoints)
+
+
+def with_rays(keypoints: Float[Tensor, "K 2"], intrinsics: Any) -> Float[Tensor, "K 2"]:
+    """Return keypoints in px of a pycolmap camera; NaN for those without a ray."""
+    return torch.where(rays_of(intrinsics, keypoints).isfinite(), keypoints, torch.nan)
+
+
+def known(pixels: Float[Tensor, "K 2"]) -> Bool[Tensor, "K"]:
+    """Return which pixel positions are finite."""
+    return pixels.isfinite().all(dim=1)
+
+
+def unmeasured(model: Model) -> Unmeasured:
+    """Count the unusable observations of a model; InputError as `pinhole_of`."""
+    rays = [known(straight_keypoints(image, model.cameras[image.camera_id])) for image in model.images]
+    ahead = [(image.observed @ image.rotation.T + image.translation)[:, 2] > 0 for image in model.images]
+    return counted([image.name for image in model.images], rays, [~one for one in ahead])
+
+
+def counted(names: list[str], rays: list[Bool[Tensor, "_"]], behind: list[Bool[Tensor, "_"]]) -> Unmeasured:
+    """Count unusable observations, by image: which keypoints have a ray, and which points lie behind the camera."""
+    return Unmeasured(
+        no_ray=sum(int((~one).sum()) for one in rays),
+        behind=sum(int((one & other).sum()) for one, other in zip(rays, behind, strict=True)),
+        blind=tuple(name for name, one in zip(names, rays, strict=True) if len(one) and not bool(one.any())),
+    )
 
 
 def shift_of(model: Model) -> float | None:
@@ -35,7 +87,9 @@ def explained(image: ModelImage, intrinsics: Any) -> float | None:
         return None
     columns, off = measured
     products = [predicted(columns, off, slice(start, None, 2), slice(1 - start, None, 2)) for start in range(2)]
-    return mean_square_focal(intrinsics) * sum(products) / len(products)
+    pinhole = pinhole_of(intrinsics)
+    mean_square = (pinhole.focal_length_x**2 + pinhole.focal_length_y**2) / 2
+    return mean_square * sum(products) / len(products)
 
 
 def offsets(image: ModelImage, intrinsics: Any) -> tuple[Float[Tensor, "K 2 8"], Float[Tensor, "K 2"]] | None:
@@ -50,12 +104,6 @@ def offsets(image: ModelImage, intrinsics: Any) -> tuple[Float[Tensor, "K 2 8"],
     centre = observed.new_tensor([pinhole.principal_point_x, pinhole.principal_point_y])
     off = (observed[usable] - centre) / focal - torch.stack([x / z, y / z], 1)
     return movements(x / z, y / z, z), off
-
-
-def mean_square_focal(intrinsics: Any) -> float:
-    """Return the mean square of both focal lengths of a pycolmap camera's pinhole, px^2."""
-    pinhole = pinhole_of(intrinsics)
-    return (pinhole.focal_length_x**2 + pinhole.focal_length_y**2) / 2
 
 
 def movements(x: Float[Tensor, "K"], y: Float[Tensor, "K"], z: Float[Tensor, "K"]) -> Float[Tensor, "K 2 8"]:

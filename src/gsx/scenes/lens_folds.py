@@ -73,7 +73,10 @@ def shows_truly(camera: Any, pinhole: Any) -> bool:
     if not bool((lattice.areas > 0).all()):
         return False
     # COLMAP finds its picture from rays of the photo's border: where some are missing, it may reach past the photo
-    return bool(border_rays(camera).isfinite().all()) or bool(inside(camera, lattice.pixels, 1.0).all())
+    x, y = (torch.linspace(0.5, side - 0.5, STEPS, dtype=torch.float64) for side in (camera.width, camera.height))
+    border = torch.cat([torch.cartesian_prod(x, y[[0, -1]]), torch.cartesian_prod(x[[0, -1]], y)])
+    rays = torch.from_numpy(camera.cam_from_img(border.numpy()))
+    return bool(rays.isfinite().all()) or bool(inside(camera, lattice.pixels, 1.0).all())
 
 
 def slopes(first: float, last: float, principal: float, focal: float, count: int) -> Float[Tensor, "N"]:
@@ -85,13 +88,6 @@ def inside(camera: Any, pixels: Float[Tensor, "*N 2"], margin: float = 0.0) -> B
     """Return which pixel positions lie on the photo of a camera, or within a margin around it, px."""
     size = pixels.new_tensor([camera.width, camera.height])
     return ((pixels >= -margin) & (pixels <= size + margin)).all(-1)
-
-
-def border_rays(camera: Any) -> Float[Tensor, "K 2"]:
-    """Return rays of pixel centres along the photo's border; NaN where there is none."""
-    x, y = (torch.linspace(0.5, side - 0.5, STEPS, dtype=torch.float64) for side in (camera.width, camera.height))
-    sides = [torch.cartesian_prod(x, y[[0, -1]]), torch.cartesian_prod(x[[0, -1]], y)]
-    return torch.from_numpy(camera.cam_from_img(torch.cat(sides).numpy()))
 
 
 def cut_where_folded(camera: Any, pinhole: Any) -> tuple[Any, Cut]:

@@ -14,8 +14,8 @@ from gsx.core.errors import InputError
 from gsx.core.files import expand_home, is_file
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.orientation import INVERSES, Turns, oriented_size
-from gsx.scenes.photo_names import SUFFIXES
 from gsx.scenes.photo_source import PhotoSource
+from gsx.scenes.pose_files import SUFFIXES
 from gsx.scenes.undistort import StoredUndistortion
 
 IMAGES = "images"  # usual folder of the photos

@@ -4,14 +4,14 @@ Programs such as COLMAP define cameras on the stored raster: photos of one lens 
 Here a photo is undistorted on that raster, and then turned upright together with its camera.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from gsx.core.data.camera import Camera, LensModel
+from gsx.core.data.camera import Camera
 from gsx.core.data.images import image_size, is_reduction
 from gsx.core.data.resize import Size
 from gsx.core.shapes import UInt8
@@ -52,7 +52,7 @@ def oriented_camera(camera: Camera, orientation: int) -> Camera:
     right, down = (-1 if axis in flips else 1 for axis in (-1, -2))
     turn = torch.zeros(3, 3, dtype=camera.rotation.dtype)  # axes of the turned camera in the stored one's
     turn[0, int(exchange)], turn[1, int(not exchange)], turn[2, 2] = right, down, 1
-    width, height = oriented_size(camera.size, orientation)
+    (width, height), lens = oriented_size(camera.size, orientation), camera.lens
     (fx, cx), (fy, cy) = ((camera.fx, camera.cx), (camera.fy, camera.cy))[:: -1 if exchange else 1]
     return replace(
         camera,
@@ -64,13 +64,8 @@ def oriented_camera(camera: Camera, orientation: int) -> Camera:
         cy=height - cy if down < 0 else cy,
         width=width,
         height=height,
-        lens=turned_lens(camera.lens, turn[:2, :2].flatten().tolist()),
+        lens=lens.turned(turn[:2, :2].flatten().tolist()) if isinstance(lens, Distortion) else lens,
     )
-
-
-def turned_lens(lens: LensModel | None, turn: Sequence[float]) -> LensModel | None:
-    """Return the lens of a camera rolled by a 2 x 2 matrix, in rows."""
-    return lens.turned(turn) if isinstance(lens, Distortion) else lens
 
 
 @dataclass(frozen=True, kw_only=True)

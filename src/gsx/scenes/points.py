@@ -12,9 +12,8 @@ from gsx.core.data.scene import PointCloud
 from gsx.core.errors import InputError
 from gsx.core.gaussians.bands import BAND_0
 from gsx.core.shapes import Float, UInt8
-from gsx.formats.colours import colours_among, full_scale_of
 from gsx.formats.origin import in_single_where_resolved
-from gsx.formats.ply import read_ply
+from gsx.formats.ply import colours_among, full_scale_of, read_ply
 
 logger = logging.getLogger(__name__)
 

@@ -19,12 +19,12 @@ from gsx.core.files import expand_home
 from gsx.core.shapes import Float
 from gsx.lenses import lens_of
 from gsx.scenes.depth_files import depth_file
-from gsx.scenes.duplicates import refuse_shared
 from gsx.scenes.masked import mask_of, masks_named
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.orientation import AFTER_MIRROR, Turned, Turns, TurnsOf, of_model, oriented_camera, oriented_size
 from gsx.scenes.photo_source import PhotoSource
 from gsx.scenes.pose_files import some_names
+from gsx.scenes.splits import refuse_shared
 from gsx.scenes.undistort import StoredUndistortion, camera_of, cut_of, pinhole_of, undistorted_size
 
 MIN_IMAGES = 2  # one photo leaves depth undetermined

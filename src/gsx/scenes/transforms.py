@@ -18,17 +18,15 @@ from gsx.core.data.scene_format import SceneFormat
 from gsx.core.errors import InputError, nearest
 from gsx.core.files import expand_home, is_file
 from gsx.core.ranges import Points, Seed
-from gsx.scenes.duplicates import photos_of
 from gsx.scenes.frame_files import FILE, TEST_FILES, TRAIN_FILE, FrameFile, frame_files, is_empty, needs_lens, nodes
 from gsx.scenes.lenses import complete_frame, lens_of
 from gsx.scenes.masked import mask_notes
 from gsx.scenes.options import SceneOptions
 from gsx.scenes.orientation import RULES, TurnsOf
-from gsx.scenes.photo_names import plain_name
 from gsx.scenes.points import random_points, stored_points
-from gsx.scenes.pose_files import frames_line, pose_from_opengl, present_frames
+from gsx.scenes.pose_files import frames_line, plain_name, pose_from_opengl, present_frames
 from gsx.scenes.posed import SAME_PLACE, Shot, check_sides, scene_of, shot_notes, shot_through, views_of
-from gsx.scenes.splits import Split, split_names
+from gsx.scenes.splits import Split, photos_of, split_names
 from gsx.scenes.undistort import METHOD
 
 LISTS = ("train_filenames", "test_filenames", "val_filenames")

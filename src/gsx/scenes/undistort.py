@@ -127,16 +127,6 @@ def undistort(
     return torch.cat([to_uint8(straight(band)) for band in bands], dim=1)
 
 
-def undistort_nearest(values: Float[Tensor, "H W"], undistortion: "StoredUndistortion") -> Float[Tensor, "h w"]:
-    """Resample a map of a photo's camera by its nearest values, on a raster of its own resolution; 0 outside."""
-    intrinsics, pinhole, (height, width) = undistortion.intrinsics, undistortion.pinhole, values.shape
-    to_map = torch.tensor([width / intrinsics.width, height / intrinsics.height], dtype=torch.float64)
-    bands = _distorted_pixels(intrinsics, pinhole, undistorted_size(intrinsics, pinhole, (width, height)))
-    column, row = (torch.cat(list(bands)) * to_map).floor().long().unbind(-1)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return torch.where(inside, values[row.clamp(0, height - 1), column.clamp(0, width - 1)], 0.0)
-
-
 def premultiplied(photo: Float[Tensor, "C H W"]) -> Float[Tensor, "C H W"]:
     """Multiply colours by alpha, if any: transparent pixels have no colour to interpolate."""
     return photo if len(photo) < 4 else torch.cat([photo[:3] * photo[3:], photo[3:]])
@@ -203,6 +193,15 @@ class StoredUndistortion:
         result = undistort(image, self.intrinsics, self.pinhole, self.size)
         cache_image(stored, result)
         return result
+
+    def nearest(self, values: Float[Tensor, "C H W"]) -> Float[Tensor, "C h w"]:
+        """Resample a map of the photo by its nearest values, on a raster of its own resolution; 0 outside."""
+        intrinsics, pinhole, (height, width) = self.intrinsics, self.pinhole, values.shape[1:]
+        to_map = torch.tensor([width / intrinsics.width, height / intrinsics.height], dtype=torch.float64)
+        bands = _distorted_pixels(intrinsics, pinhole, undistorted_size(intrinsics, pinhole, (width, height)))
+        column, row = (torch.cat(list(bands)) * to_map).floor().long().unbind(-1)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        return torch.where(inside, values[:, row.clamp(0, height - 1), column.clamp(0, width - 1)], 0.0)
 
     def stored(self) -> Path:
         """Return the place of the result in the cache, by photo, cameras and method."""

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsx.augmenters.consistency import consistent_pixels, exactly_consistent
+from gsx.augmenters.redraw import consistent_pixels, exactly_consistent
 from gsx.core.data.reduction import TOLERANCE, Reduction, projected
 from gsx.core.data.resize import display_from_linear, resize, to_uint8
 from gsx.core.quality.metrics import psnr

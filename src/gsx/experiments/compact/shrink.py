@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, replace
 import torch
 from torch import Tensor
 
-from gsx.backbones.colour_fits import colour_fits, fitted, take_coefficients
+from gsx.backbones.sh_degrees import colour_fits, fitted, take_coefficients
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
 from gsx.core.data.window import Window

@@ -7,7 +7,7 @@ from pathlib import PurePosixPath
 
 from gsx.core.data.camera import Camera
 from gsx.core.data.scene import View
-from gsx.scenes.photo_names import SUFFIXES
+from gsx.scenes.pose_files import SUFFIXES
 from gsx.scenes.splits import sort_key
 
 SUFFIX = ".png"

@@ -26,15 +26,13 @@ from gsx.engine.cache import cache_folder, content_key
 from gsx.engine.machine import machine_stamp
 from gsx.regenerators.diffusion import adapters
 from gsx.regenerators.diffusion.adapters import FACTS, WEIGHTS
-from gsx.regenerators.diffusion.model_specs import Batch, ModelSpec, bytes_of, steps_for
+from gsx.regenerators.diffusion.model_specs import Batch, ModelSpec, bytes_of, padded_to, steps_for
 from gsx.regenerators.diffusion.models import code_stamp
 from gsx.regenerators.diffusion.options import RestorerOptions, TuningOptions
-from gsx.regenerators.diffusion.pace import Pace
-from gsx.regenerators.diffusion.sizes import padded_to
-from gsx.regenerators.pairs import Pair, held_out_pairs, mean_square, random_part, with_own
+from gsx.regenerators.networks import Pair, held_out_pairs, mean_square, random_part, with_own
 
+LOG_SECONDS = 10.0  # between two lines of progress
 logger = logging.getLogger(__name__)
-
 REASONS = {
     "raw": "tuning does not help on held-out renders",
     "renders": "held-out renders are closest to their photographs as they are (regenerator/restore=identity)",
@@ -42,6 +40,29 @@ REASONS = {
 """Why an adapter is not merged, by `closest`."""
 WEIGHT_DECAY = 1e-2
 LARGEST_NORM = 1.0  # to which gradients are clipped
+
+
+class Pace:
+    """Progress of a batch of work, with an estimate of the time that is left."""
+
+    def __init__(self, name: str, total: int) -> None:
+        self.name, self.total, self.done = name, total, 0
+        self.start = self.logged = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the work began."""
+        return time.perf_counter() - self.start
+
+    def advance(self, count: int) -> None:
+        """Count finished work, and log it from time to time."""
+        self.done += count
+        now = time.perf_counter()
+        if now - self.logged > LOG_SECONDS and self.done < self.total:
+            each = (now - self.start) / self.done
+            left = each * (self.total - self.done)
+            logger.info("%s: %d of %d, %.1f s each, %.0f s left", self.name, self.done, self.total, each, left)
+            self.logged = now
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,33 +1,99 @@
 """Pretrained upscalers: SPAN, Real-ESRGAN, and any network in a file of ncnn or ONNX."""
 
+import hashlib
 import itertools
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsx.core.data.reduction import Reduction
+from gsx.core.data.resize import to_uint8
 from gsx.core.data.scene import View
+from gsx.core.data.window import Window
 from gsx.core.errors import ConfigError, InputError
 from gsx.core.files import replace_file
-from gsx.core.shapes import Float
+from gsx.core.shapes import Float, UInt8
 from gsx.core.training.regenerator import RegeneratorContext, Request
-from gsx.regenerators.pretrained.model_files import RUNNERS, Model, locate_models
-from gsx.regenerators.pretrained.options import SCALES, PretrainedOptions
-from gsx.regenerators.pretrained.photo_store import PhotoStore
+from gsx.engine.cache import cache_folder, content_key
+from gsx.engine.cached_images import cache_image, read_cached_image
+from gsx.regenerators.pretrained.model_files import RUNNERS, SCALES, Model, PretrainedOptions, locate_models
 from gsx.regenerators.pretrained.process import NetworkProcess
 from gsx.regenerators.pretrained.tiles import Picture, run_in_tiles
 
+Enlarge: TypeAlias = Callable[[Float[Tensor, "3 h w"], int, Reduction], Tensor]
+"""(picture, scale, filter of the scene) -> picture `scale` times as large."""
 MOST_PASSES = 4
 """Most networks that are applied one after the other."""
 TRIAL = 24
 """Side of the picture that each network is tried with before training, px."""
+
+
+class PhotoStore:
+    """Photos at several times their size, in 8 bits, in memory and in the cache."""
+
+    def __init__(self, gigabytes: float, enlarge: Enlarge, recipe: Callable[[], object]) -> None:
+        self.gigabytes, self.enlarge, self.recipe = gigabytes, enlarge, recipe
+        self.pixels = 0
+        """Pixels of all training photos; 0: unknown."""
+        self.enlarged: dict[tuple[int, int], UInt8[Tensor, "3 H W"]] = {}
+        """Enlarged photos by number of the view and scale."""
+
+    def expect(self, views: Sequence[View]) -> None:
+        """Counts the pixels that there will be to enlarge."""
+        self.pixels = sum(view.camera.width * view.camera.height for view in views)
+
+    def has(self, request: Request) -> bool:
+        """Returns whether a request is a photo without mask, or a window of it if all photos fit at its scale."""
+        whole = request.camera.size == request.view.camera.size
+        fits = 0 < 3 * self.pixels * request.scale**2 <= 1e9 * self.gigabytes
+        return (whole or fits) and request.photo and request.scale > 1 and request.view.counted() is None
+
+    def cut(self, request: Request) -> Float[Tensor, "3 H W"]:
+        """Returns the requested window of the enlarged photo."""
+        key, window = (request.number, request.scale), enlarged_window(request)
+        picture = self.enlarged[key] if key in self.enlarged else self.made(request)
+        if tuple(picture.shape[1:]) != (window.height, window.width):  # a whole photo is requested once
+            self.enlarged[key] = picture
+        return window.cut(picture).float() / 255
+
+    def made(self, request: Request) -> UInt8[Tensor, "3 H W"]:
+        """Reads the enlarged photo of a request from the cache, or makes it."""
+        photo = request.view.image()
+        path = self.path(photo, request)
+        cached = read_cached_image(path)
+        if cached is not None:
+            return cached
+        result = self.enlarge(photo, request.scale, request.reduction)
+        if not bool(torch.isfinite(result).all()):
+            raise InputError(
+                f"regenerator: the network returns values that are not finite for '{request.view.name}'. "
+                "Choose another network, or leave that photo out."
+            )
+        picture = to_uint8(result.clamp(0, 1))
+        cache_image(path, picture)
+        return picture
+
+    def path(self, photo: Float[Tensor, "3 h w"], request: Request) -> Path:
+        """Returns the place of an enlarged photo in the cache, by all that decides its pixels."""
+        digest = hashlib.sha256(to_uint8(photo).numpy().tobytes()).hexdigest()
+        recipe = content_key(self.recipe(), request.scale, asdict(request.reduction))
+        return cache_folder("enlarged_photos", recipe) / f"{content_key(digest, photo.shape)}.png"
+
+
+def enlarged_window(request: Request) -> Window:
+    """Returns the window of a request on the enlarged photo."""
+    camera, whole, scale = request.camera, request.view.camera, request.scale
+    left, top = round(whole.cx - camera.cx), round(whole.cy - camera.cy)
+    return Window(left=scale * left, top=scale * top, width=scale * camera.width, height=scale * camera.height)
 
 
 class Pretrained:
@@ -93,11 +159,10 @@ class Pretrained:
 
     def regenerate(self, requests: Sequence[Request]) -> list[Float[Tensor, "3 H W"]]:
         """Returns each picture `scale` times as large; windows of photos are cut from whole enlarged photos."""
-        return [self.photos.cut(one) if self.photos.has(one) else self.enlarge_request(one) for one in requests]
-
-    def enlarge_request(self, request: Request) -> Float[Tensor, "3 H W"]:
-        """Enlarges the picture of a request."""
-        return self.enlarge(request.image.cpu(), request.scale, request.reduction)
+        return [
+            self.photos.cut(one) if self.photos.has(one) else self.enlarge(one.image.cpu(), one.scale, one.reduction)
+            for one in requests
+        ]
 
     def enlarge(self, image: Float[Tensor, "3 h w"], scale: int, reduction: Reduction) -> Float[Tensor, "3 H W"]:
         """Enlarges a picture by one network after the other, and reduces what is too large as the scene does."""

@@ -171,8 +171,3 @@ def ground_colour(life: StillLife, points: Float[Tensor, "3 points"]) -> Float[T
     radius = (points[0] * points[0] + points[1] * points[1]).sqrt()
     haze = smoothstep((radius - textures.HAZE[0]) / (textures.HAZE[1] - textures.HAZE[0]))
     return textures.ground(points, life.kit) * (shade + (1.0 - shade) * haze)
-
-
-def sky_colour(life: StillLife, points: Float[Tensor, "3 points"]) -> Float[Tensor, "3 points"]:
-    """Return the display colour of points on the dome."""
-    return textures.sky(points / DOME, life.kit)

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from gsx.core.data.camera import Camera
 from gsx.core.shapes import Float, Int, UInt8
+from gsx.scenes.demo import textures
 from gsx.scenes.demo.solids import SPHERE, column, dot, normalise, shape_interval, sum_of, window
-from gsx.scenes.demo.still_life import DOME, StillLife, ground_colour, sky_colour, thing_colour
+from gsx.scenes.demo.still_life import DOME, StillLife, ground_colour, thing_colour
 
 BAND_RAYS = 1 << 17  # rays evaluated at once: about 50 MB of working memory
 SUBPIXEL = 2.0**20  # principal points are rounded to 1/SUBPIXEL px, so that a crop's whole-pixel shift is exact
@@ -133,7 +134,7 @@ def colours_of(life: StillLife, hits: HitPoints) -> Float[Tensor, "3 points"]:
         for chosen in (hits.owner == number).nonzero()[:, 0].split(BAND_RAYS):
             points, directions = (vectors.index_select(1, chosen) for vectors in (hits.points, hits.directions))
             if number == SKY:
-                part = sky_colour(life, points)
+                part = textures.sky(points / DOME, life.kit)
             elif number == GROUND:
                 part = ground_colour(life, points)
             else:
