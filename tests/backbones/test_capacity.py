@@ -373,7 +373,8 @@ def test_photographs_are_compared_with_what_they_would_show_of_the_model(how: st
             blur.movements = {view.name: (across / view.camera.width, 0.0) for view in scene.train}
         elif known:
             matrices = torch.cat([gain * torch.eye(3), torch.zeros(3, 1)], 1).repeat(len(scene.train), 1, 1)
-            exposure.start(matrices, light.repeat(len(scene.train), 1, 1, 1) if how == "shaded" else None)
+            grids = {"grids": light.repeat(len(scene.train), 1, 1, 1)} if how == "shaded" else {}
+            exposure.start(matrices=matrices, **grids)
         context = small_context(scene, modules={"exposure": exposure, "blur": blur})
         judge = Adaptive(AdaptiveOptions(window=0.5 if how == "shaded" else 1.0), context, PUBLISHED, 0)
         lost.append(judge.gain(model, model.table, half, 700)[0])

@@ -60,12 +60,13 @@ def warm_or_eager(run: Run, path: str) -> bool:
     """Compile what steps need; return True if that failed at the start of a run, which then draws by the eager path.
 
     Raises:
-        CompilerError: it failed, and `path`, that of the settings, is not auto, or the run is at a later step.
+        CompilerError: it failed, and the settings name this `path`, or the run is at a later step or one of several.
     """
     try:
         warm(run)
     except CompilerError as error:
-        if path != "auto" or run.step > 0 or run.ranks.size > 1:
+        chosen_by_gsx = path == "auto" and run.raster.path == "compiled"
+        if not chosen_by_gsx or run.step > 0 or run.ranks.size > 1:
             raise
         logger.warning("%s; using the eager path, which is several times slower", error)
         run.raster = run.backbone.raster = replace(run.raster, path="eager")
