@@ -292,7 +292,7 @@ def _map(database: Path, folder: Path, sparse: Path, count: int, options: SfmOpt
             cancellation_token=cancellation_token,
         )
 
-    return run_stage("placing photos", reconstruct, lambda: len(placed), count)
+    return run_stage("placing photos", reconstruct, lambda: min(len(placed), count), count)  # maps begin anew
 
 
 def run_stage(stage: str, work: Callable[..., Any], done: Callable[[], int], total: int) -> Any:
