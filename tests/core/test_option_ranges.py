@@ -102,3 +102,9 @@ def nested(node: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
     """A copy with another value at a dotted key."""
     head, _, rest = key.partition(".")
     return node | {head: nested(node[head], rest, value) if rest else value}
+
+
+def test_bounds_that_are_equal_read_alike() -> None:
+    """`typing` keeps one annotation for both."""
+    assert str(Range(0, 1e6)) == str(Range(0, 10**6)) == "from 0 to 1,000,000"
+    assert str(Range(0.5, 2**63 - 1)) == "from 0.5 to 9,223,372,036,854,775,807"

@@ -20,7 +20,8 @@ class Range:
         return self.least <= value <= self.most
 
     def __str__(self) -> str:
-        return f"from {self.least:,} to {self.most:,}"
+        least, most = (int(bound) if float(bound).is_integer() else bound for bound in (self.least, self.most))
+        return f"from {least:,} to {most:,}"  # alike for 10**6 and 1e6, which are equal: typing keeps one for both
 
 
 MOST_STEPS = 10**9
