@@ -31,9 +31,9 @@ def add_backbones(registry: Registry) -> None:
     """Register free Gaussians and anchors, with and without levels and filters."""
     from gsx.backbones.anchor_options import NeuralOptions
     from gsx.backbones.anchors import neural_anchors
-    from gsx.backbones.clone_split import OctreeGS3DOptions, octree_gs3d
     from gsx.backbones.gs3d import gs3d
     from gsx.backbones.gs3d_options import GS3DOptions
+    from gsx.backbones.octree_gs3d import OctreeGS3DOptions, octree_gs3d
 
     for name in ("gs3d", "mip_splatting", "gs3d_zoom"):
         registry.add("backbone", name, gs3d, GS3DOptions)

@@ -14,12 +14,9 @@ from torch import Tensor
 
 from gsx.backbones.clone_split import (
     LevelDensityOptions,
-    OctreeGS3DOptions,
     VisibleByLevel,
     clones,
     densify_masks,
-    free_gaussians,
-    free_options,
     relative_sizes,
     small_children,
     starting_points,
@@ -27,6 +24,7 @@ from gsx.backbones.clone_split import (
 from gsx.backbones.density import within_room
 from gsx.backbones.gs3d import GS3D
 from gsx.backbones.levels import Levels, initial_nodes, kept
+from gsx.backbones.octree_gs3d import OctreeGS3DOptions, free_gaussians, free_options
 from gsx.backbones.visibility import everything, extents
 from gsx.builtin import plugins
 from gsx.core.data.camera import Camera, look_at

@@ -94,8 +94,7 @@ def dispatch_together(arguments: list[str]) -> int:
 def dispatch(arguments: list[str]) -> int:
     """Run the command that the words name."""
     first = arguments[0] if arguments else ""
-    known = not first or first.startswith("-") or is_override(first) or expand_home(first).exists()
-    if first == "help" or ({"--help", "-h"} & set(arguments) and first not in VERBS and known):
+    if first == "help" or ({"--help", "-h"} & set(arguments) and first not in VERBS and not is_unknown(first)):
         sys.stdout.write(HELP)
         return 0
     if arguments == ["--version"]:
@@ -109,6 +108,11 @@ def dispatch(arguments: list[str]) -> int:
     if expand_home(first).exists():
         return TRAIN_FOLDER(arguments)
     raise ConfigError(unknown_command(first))
+
+
+def is_unknown(word: str) -> bool:
+    """Return True for a word that names neither a setting, an option nor a path."""
+    return bool(word) and not word.startswith("-") and not is_override(word) and not expand_home(word).exists()
 
 
 def unknown_command(word: str) -> str:

@@ -45,16 +45,17 @@ class InBands:
         grid: TileGrid,
         settings: RasterSettings,
     ) -> tuple[Float[Tensor, "C_plus_1 H W"], Float[Tensor, "M"] | None]:
-        screen = replace(screen, channels=channels)
-        fields = [getattr(screen, name) for name in FIELDS]
-        learning = torch.is_grad_enabled() and any(field is not None and field.requires_grad for field in fields)
         few = len(intersections.splats) <= self.pairs
-        if few or not learning or screen.weigh or screen.means.device.type != "cpu":
+        if few or screen.weigh or screen.means.device.type != "cpu":
             return self.composite(screen, channels, intersections, grid, settings)
+        fields = [channels if name == "channels" else getattr(screen, name) for name in FIELDS]
+        if not torch.is_grad_enabled() or not any(field is not None and field.requires_grad for field in fields):
+            return self.composite(screen, channels, intersections, grid, settings)
+        nearness = nearness_of(intersections)
 
         def blend(rows: range, fields: list[Any]) -> Float[Tensor, "C_plus_1 h W"]:
             splats = replace(screen, **dict(zip(FIELDS, fields, strict=True)))
-            pairs, raster = pairs_of(intersections, rows, grid), band_of(grid, rows)
+            pairs, raster = pairs_of(intersections, nearness, rows, grid), band_of(grid, rows)
             return self.composite(splats, splats.channels, pairs, raster, settings)[0]
 
         return Picture.apply(blend, band_rows(intersections.starts, grid, -(-self.pairs // SHARE)), *fields), None
@@ -102,13 +103,18 @@ def band_of(grid: TileGrid, rows: range) -> TileGrid:
     return replace(grid, top=top, height=bottom - top)
 
 
-def pairs_of(every: TileIntersections, rows: range, grid: TileGrid) -> TileIntersections:
-    """Returns the intersections with some tile rows of a picture."""
+def nearness_of(every: TileIntersections) -> Int[Tensor, "M"]:
+    """Returns the place of each splat in the order of blending."""
+    nearness = torch.empty_like(every.order)
+    nearness[every.order] = torch.arange(len(every.order))
+    return nearness
+
+
+def pairs_of(every: TileIntersections, nearness: Int[Tensor, "M"], rows: range, grid: TileGrid) -> TileIntersections:
+    """Returns the intersections with some tile rows of a picture; `nearness`: of all splats."""
     first, past = (row * grid.shape[0] for row in (rows.start, rows.stop))
     begin, end = every.starts[[first, past]].tolist()
     splats = every.splats[begin:end]
-    nearness = torch.empty_like(every.order)
-    nearness[every.order] = torch.arange(len(every.order))
     ranks, places = sorted_stably(nearness[splats])
     slots = torch.empty_like(places)
     slots[places] = torch.arange(len(places))

@@ -16,7 +16,7 @@ from gsx.core.errors import ConfigError
 from gsx.core.ranges import MOST_STEPS, Range, Seconds, Share, Steps
 from gsx.core.training.module import ModuleContext, TrainingModule
 from gsx.core.training.run import Run
-from gsx.modules.plateau import last_milestone, next_milestone
+from gsx.modules.milestones import last_milestone, next_milestone
 
 logger = logging.getLogger(__name__)
 
@@ -92,13 +92,15 @@ class Deadline(TrainingModule):
         if last < first:
             return {}
         self.skipped += range(first, last + 1)
-        metrics = {"steps_left_out": float(last + 1 - first)}
-        if self.active:
-            used, limit = run.progress.seconds, self.options.seconds
-            logger.info("step %d: %.0f s of %.0f s used, skipping to step %d", run.step, used, limit, last + 1)
-            metrics |= {"late_from": float(first), "late_to": float(last)}
+        clocked = self.log_late(run, first, last) if self.active else {}
         run.step = last
-        return metrics
+        return {"steps_left_out": float(last + 1 - first)} | clocked
+
+    def log_late(self, run: Run, first: int, last: int) -> dict[str, float]:
+        """Logs steps that are skipped because the run is late; returns their metrics."""
+        used, limit = run.progress.seconds, self.options.seconds
+        logger.info("step %d: %.0f s of %.0f s used, skipping to step %d", run.step, used, limit, last + 1)
+        return {"late_from": float(first), "late_to": float(last)}
 
     def supports(self, ranks: int) -> bool:
         """Returns whether each process would skip the same steps."""
@@ -143,10 +145,14 @@ class Deadline(TrainingModule):
         stop = self.last_stretch if run.step < self.last_stretch else self.context.iterations
         if run.step < self.first_allowed():
             return 0
-        least = LEAST_EARLY if run.step < last_milestone(run, stop) else LEAST
-        least = LEAST_END if run.step >= self.last_stretch else least
-        taken = min(1.0, max(least, self.share_in_time(run.step)))
+        taken = min(1.0, max(self.least_taken(run, stop), self.share_in_time(run.step)))
         return min(run.step + math.floor((1 - taken) * window), next_milestone(run, run.step, stop) - 1)
+
+    def least_taken(self, run: Run, stop: int) -> float:
+        """Returns the least share of the steps that a window takes."""
+        if run.step >= self.last_stretch:
+            return LEAST_END
+        return LEAST_EARLY if run.step < last_milestone(run, stop) else LEAST
 
     def mark(self, run: Run) -> None:
         """Notes the clock before a window."""

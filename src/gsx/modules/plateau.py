@@ -19,11 +19,11 @@ from gsx.core.data.scene import View
 from gsx.core.data.window import Window
 from gsx.core.ranges import Range, Share
 from gsx.core.shapes import Float
-from gsx.core.training.backbone import WithMilestones
 from gsx.core.training.importance import Probe
 from gsx.core.training.module import ModuleContext, TrainingModule
 from gsx.core.training.run import Run
 from gsx.core.training.validation import decibels, rounding_in, validation_windows
+from gsx.modules.milestones import last_milestone
 
 logger = logging.getLogger(__name__)
 
@@ -183,19 +183,3 @@ def errors_in(run: Run, windows: Mapping[View, Window], step: int) -> Float[Tens
         return torch.zeros(0, dtype=torch.float64)
     probe = Probe(model=run.backbone, views=run.views, step=run.model_step, raster_step=step)
     return run.ranks.broadcast(lambda: probe.window_errors(windows).cpu())
-
-
-def milestones_of(run: Run) -> list[int]:
-    """Returns the milestones of modules and backbone, in no order."""
-    steps = list(run.backbone.milestones()) if isinstance(run.backbone, WithMilestones) else []
-    return steps + [step for module in run.modules.values() for step in module.milestones()]
-
-
-def last_milestone(run: Run, before: int) -> int:
-    """Returns the last milestone before a step; 0: there is none."""
-    return max((step for step in milestones_of(run) if step < before), default=0)
-
-
-def next_milestone(run: Run, after: int, before: int) -> int:
-    """Returns the first milestone after a step; if there is none before another, that one."""
-    return min((step for step in milestones_of(run) if after < step < before), default=before)

@@ -211,8 +211,7 @@ class Search:
         candidate = self.evaluate(best.removed, degree)
         if self.allowed(candidate):
             return candidate
-        rows, size = size_of(self.run.backbone.table)  # least: with it a model of that degree is as small
-        least = max(0.0, 1 - best.megabytes / (size_with(self.run, degree, size) / 1e6 / rows * rows))
+        least = self.share_as_small(best, degree)
         if not self.allowed(self.evaluate(least, degree)):  # with fewer rows still less
             return None
         return self.fewest_rows(degree, least, best.removed)
@@ -228,6 +227,11 @@ class Search:
             else:
                 most = share
         return best
+
+    def share_as_small(self, best: Candidate, degree: int) -> float:
+        """Returns the share of rows without which a model of a degree is as small as another."""
+        _, size = size_of(self.run.backbone.table)
+        return max(0.0, 1 - best.megabytes / (size_with(self.run, degree, size) / 1e6))
 
     def trained(self, candidate: Candidate) -> Run:
         """Returns the run with a candidate's model, fine-tuned on all training views."""

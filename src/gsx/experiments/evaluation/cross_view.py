@@ -169,12 +169,16 @@ class CrossViews:
         kept = self.kept[zoomed.factor]
         kept[view] = self.surface_view(zoomed, view)
         for one, other in [p for p in pairs if p[0] in kept and (p[1] in kept or p[1] not in self.test)]:
-            rendered = None if other in kept else self.zoom(other, zoomed.factor)
-            neighbouring = kept[other] if rendered is None else self.surface_view(rendered, other)
-            self.found[zoomed.factor].add(kept[one], neighbouring)
+            self.found[zoomed.factor].add(kept[one], kept.get(other) or self.neighbour_view(other, zoomed.factor))
             pairs.remove((one, other))
         for done in kept.keys() - {one for pair in pairs for one in pair}:
             del kept[done]
+
+    def neighbour_view(self, view: View, factor: float) -> SurfaceView:
+        """Renders a training view."""
+        zoomed = self.zoom(view, factor)
+        assert zoomed is not None, "neighbours have a truth at that zoom"
+        return self.surface_view(zoomed, view)
 
     def surface_view(self, zoomed: Zoomed, view: View) -> SurfaceView:
         """Returns a zoomed view with what is visible in it."""

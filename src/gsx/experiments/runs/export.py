@@ -1,7 +1,7 @@
 """Splat files of a run or of another file, and pages that show one."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -201,16 +201,21 @@ def losses(
 
     own = [render(run, view.camera, settings.evaluation.tile_pixels).image for view in views]
     read, before = pictures(again), pictures(inside) if written.baked else own
-    worst = min(map(psnr, read, before))
+    worst = min(levels(read, before))
     lines = [f"{worst:.1f} dB at worst over {len(views)} views (inf: identical), {path.stat().st_size / 1e6:,.2f} MB"]
     if written.baked:
         truth = [view.image().to(own[0]) for view in views]
-        alike, model, baked = (fmean(map(psnr, a, b)) for a, b in ((before, own), (own, truth), (before, truth)))
+        alike, model, baked = (fmean(levels(a, b)) for a, b in ((before, own), (own, truth), (before, truth)))
         lines.append(
             f"baked for all views: {alike:.1f} dB against the model; {baked:.2f} dB against photos, the model has "
             f"{model:.2f} dB: {model - baked:.2f} dB lost"
         )
     return lines
+
+
+def levels(pictures: Sequence[Float[Tensor, "3 H W"]], others: Sequence[Float[Tensor, "3 H W"]]) -> Iterator[float]:
+    """Yield the PSNR of each pair."""
+    return (psnr(a, b) for a, b in zip(pictures, others, strict=True))
 
 
 def as_in_page(gaussians: Gaussians) -> Gaussians:
